@@ -1,0 +1,93 @@
+"""Parameters, optimiser and one gradient step, shared by both methods."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from sqn_jax.agent.loss import LossOutput
+from sqn_jax.agent.networks import Params, QNetwork, initial_carry
+from sqn_jax.config import LearnerConfig
+
+
+@struct.dataclass
+class LearnerState:
+    """What learning changes."""
+
+    params: Params
+    """Online parameters."""
+    target_params: Params
+    """Slowly following copy; None for a method without one."""
+    opt_state: Any
+    """Adam's moments and counter."""
+    num_updates: Array
+    """int32."""
+
+
+def make_optimizer(config: LearnerConfig, total_updates: int) -> optax.GradientTransformation:
+    """Adam with gradients clipped by their global norm and the configured schedule."""
+    learning_rate: float | optax.Schedule = config.learning_rate
+    if config.learning_rate_schedule == "linear":
+        learning_rate = optax.linear_schedule(config.learning_rate, 0.0, total_updates)
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adam(learning_rate, eps=config.adam_epsilon),
+    )
+
+
+def init_learner(
+    key: Array,
+    network: QNetwork,
+    optimizer: optax.GradientTransformation,
+    obs: Any,
+    *,
+    use_target: bool,
+) -> LearnerState:
+    """Fresh parameters for observations like `obs` [T, B, ...]; the key is consumed."""
+    batch_size = jax.tree.leaves(obs)[0].shape[1]
+    params = network.init(key, obs, initial_carry(network.config, batch_size))
+    return LearnerState(
+        params=params,
+        target_params=jax.tree.map(jnp.copy, params) if use_target else None,
+        opt_state=optimizer.init(params),
+        num_updates=jnp.int32(0),
+    )
+
+
+def gradient_step(
+    state: LearnerState,
+    optimizer: optax.GradientTransformation,
+    loss_function: Callable[[Params], tuple[Array, LossOutput]],
+) -> tuple[LearnerState, LossOutput, dict[str, Array]]:
+    """One step of the optimiser down a loss of the online parameters.
+
+    Returns:
+        The new state, the loss's by-products, and scalars worth logging.
+    """
+    (loss, output), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params)
+    updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+    new_state = state.replace(
+        params=optax.apply_updates(state.params, updates),
+        opt_state=opt_state,
+        num_updates=state.num_updates + 1,
+    )
+    metrics = {
+        "loss": loss,
+        "gradient_norm": optax.global_norm(gradient),
+        "mean_q": output.mean_q,
+        "gate_entropy": output.gate_entropy,
+        "skill_distance": output.skill_distance,
+    }
+    return new_state, output, metrics
+
+
+def update_target(state: LearnerState, rate: float) -> LearnerState:
+    """Polyak averaging: target <- (1 - rate) target + rate online."""
+    target = optax.incremental_update(state.params, state.target_params, rate)
+    return state.replace(target_params=target)

@@ -1,0 +1,143 @@
+"""TD errors of a batch of whole episodes: the R2D2 loss and the recurrent PQN loss."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from sqn_jax.agent.experience import Episodes
+from sqn_jax.agent.networks import Params, QNetwork, QOutput, initial_carry
+from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
+from sqn_jax.config import LearnerConfig
+
+
+@struct.dataclass
+class LossOutput:
+    """What a loss knows besides its value."""
+
+    td_errors: Array
+    """[T', B] target minus prediction, for the T' steps that are learned from."""
+    mean_q: Array
+    """Mean value of the taken actions, as the network predicts it."""
+    gate_entropy: Array
+    """Mean entropy of the skill decision, nat; log K if it never prefers a skill."""
+    skill_distance: Array
+    """Mean absolute difference between the skills' Q-values and their mean."""
+
+
+def r2d2_loss(
+    params: Params,
+    target_params: Params,
+    network: QNetwork,
+    episodes: Episodes,
+    weights: Array,
+    config: LearnerConfig,
+) -> tuple[Array, LossOutput]:
+    """Mean squared TD error after burn-in, against n-step double-Q targets (R2D2, section 2.3).
+
+    The first `burn_in_length` steps only bring the recurrent state up to date: with the online
+    parameters for the online values, with the target parameters for the target values, on the
+    same observations, and without a gradient.
+
+    Args:
+        params: online parameters.
+        target_params: target parameters.
+        network: one of the three.
+        episodes: [T (+ 1), B, ...].
+        weights: [B] importance-sampling weights.
+        config: the learner's settings.
+
+    Returns:
+        The loss and its by-products.
+    """
+    burn_in = config.burn_in_length
+    online = _values_after_burn_in(network, params, episodes.obs, burn_in)
+    target = _values_after_burn_in(network, target_params, episodes.obs, burn_in)
+    chooser = online if config.double_q else target
+    best_action = jnp.argmax(chooser.q_values, axis=-1)
+    bootstrap = jax.lax.stop_gradient(_pick(target.q_values, best_action))
+    learned = jax.tree.map(
+        lambda x: x[burn_in:], (episodes.actions, episodes.rewards, episodes.terminated)
+    )
+    multi_step = partial(n_step_targets, n_step=config.n_step)
+    return _squared_error(online, bootstrap, learned, multi_step, weights, config)
+
+
+def pqn_loss(
+    params: Params, network: QNetwork, episodes: Episodes, config: LearnerConfig
+) -> tuple[Array, LossOutput]:
+    """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
+
+    The episodes are fresh and whole, so the recurrent state starts at zero as it did when they
+    were driven; there is no burn-in, no replay and no target network. Arguments as for
+    `r2d2_loss`.
+    """
+    online = _values_after_burn_in(network, params, episodes.obs, 0)
+    bootstrap = jax.lax.stop_gradient(online.q_values.max(axis=-1))
+    learned = (episodes.actions, episodes.rewards, episodes.terminated)
+    multi_step = partial(lambda_targets, trace_decay=config.trace_decay)
+    weights = jnp.ones(episodes.rewards.shape[1])
+    return _squared_error(online, bootstrap, learned, multi_step, weights, config)
+
+
+def _values_after_burn_in(
+    network: QNetwork, params: Params, obs: Any, burn_in_length: int
+) -> QOutput:
+    """Outputs for the observations from `burn_in_length` on, warmed up on those before."""
+    batch_size = jax.tree.leaves(obs)[0].shape[1]
+    carry = initial_carry(network.config, batch_size)
+    if burn_in_length > 0:
+        warm_up = jax.tree.map(lambda x: x[:burn_in_length], obs)
+        carry, _ = network.apply(params, warm_up, carry)
+        carry = jax.lax.stop_gradient(carry)
+    _, output = network.apply(params, jax.tree.map(lambda x: x[burn_in_length:], obs), carry)
+    return output
+
+
+def _squared_error(
+    online: QOutput,
+    bootstrap: Array,
+    learned: tuple[Array, Array, Array],
+    multi_step: Any,
+    weights: Array,
+    config: LearnerConfig,
+) -> tuple[Array, LossOutput]:
+    """Compare the taken actions' values with targets built from `bootstrap` [T' + 1, B]."""
+    actions, rewards, terminated = learned
+    discounts = config.discount * (1.0 - terminated.astype(jnp.float32))
+    if config.value_rescaling:
+        bootstrap = inverse_rescale(bootstrap)
+    targets = jax.vmap(multi_step, in_axes=1, out_axes=1)(rewards, discounts, bootstrap)
+    if config.value_rescaling:
+        targets = rescale(targets)
+    predictions = _pick(online.q_values[:-1], actions)
+    td_errors = jax.lax.stop_gradient(targets) - predictions
+    loss = 0.5 * (weights[None] * td_errors**2).mean()
+    return loss, LossOutput(
+        td_errors=jax.lax.stop_gradient(td_errors),
+        mean_q=predictions.mean(),
+        gate_entropy=gate_entropy(online.skill_weights).mean(),
+        skill_distance=skill_distance(online.skill_q_values).mean(),
+    )
+
+
+def gate_entropy(skill_weights: Array) -> Array:
+    """Entropy of skill decisions [..., K], nat; 0 if one skill has all the weight."""
+    return -(skill_weights * jnp.log(jnp.maximum(skill_weights, 1e-12))).sum(axis=-1)
+
+
+def skill_distance(skill_q_values: Array) -> Array:
+    """How far the skills' Q-values [..., K, A] are apart: mean absolute deviation over skills."""
+    centre = skill_q_values.mean(axis=-2, keepdims=True)
+    return jnp.abs(skill_q_values - centre).mean(axis=(-2, -1))
+
+
+def _pick(q_values: Array, actions: Array) -> Array:
+    """Values [T, B] of actions [T, B] out of [T, B, A]; a product, since gathers have slow adjoints."""
+    chosen = jax.nn.one_hot(actions, q_values.shape[-1], dtype=q_values.dtype)
+    return (q_values * chosen).sum(axis=-1)

@@ -1,0 +1,209 @@
+"""The three networks of the paper behind one interface: SQN, R2D2 and DQN (section III-B, IV-E).
+
+Each maps a time-major sequence of observations and a recurrent state to Q-values. The learner and
+the rollout know only this interface; which network runs is a matter of configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from sqn_jax.agent.gru import GRU
+from sqn_jax.config import Algorithm, NetworkConfig
+
+Params = Any
+"""A Linen parameter tree."""
+
+HEAD_SCALE = 0.1
+"""Initial scale of Q-heads and of the skill decision: small values, no skill preferred."""
+
+
+class HasObservation(Protocol):
+    """What a network looks at: `ranges` [T, B, R] and `goal` [T, B, G], all in 0..1."""
+
+    @property
+    def ranges(self) -> Array: ...
+
+    @property
+    def goal(self) -> Array: ...
+
+
+@struct.dataclass
+class QOutput:
+    """Output of a network for T steps of B robots, A actions and K skills (K is 1 without)."""
+
+    q_values: Array
+    """[T, B, A] action values; with value rescaling, of h(Q)."""
+    skill_weights: Array
+    """[T, B, K] the skill decision eta (eq. 4), positive and summing to 1."""
+    skill_q_values: Array
+    """[T, B, K, A] action values of each skill (eq. 5)."""
+
+
+class MLP(nn.Module):
+    """Two linear layers with a ReLU in between, optionally layer-normalised before it."""
+
+    hidden_size: int
+    output_size: int
+    layer_norm: bool
+    output_scale: float = 1.0
+    """Scale of the output layer's initial weights; small for a head, which then starts near 0."""
+
+    @nn.compact
+    def __call__(self, inputs: Array) -> Array:
+        """Map [..., D] to [..., output_size]."""
+        hidden = _dense(self.hidden_size, "hidden")(inputs)
+        if self.layer_norm:
+            hidden = _layer_norm("norm")(hidden)
+        return _dense(self.output_size, "output", self.output_scale)(nn.relu(hidden))
+
+
+class Features(nn.Module):
+    """Both observations through an MLP each, side by side (eq. 1): [..., 2 x hidden_size]."""
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, obs: HasObservation) -> Array:
+        """Map an observation [T, B, ...] to features [T, B, 2 H]."""
+        size = self.config.hidden_size
+        # Never normalised: over two inputs it would keep their ratio and lose their size.
+        ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges)
+        goal = MLP(size, size, layer_norm=False, name="goal")(obs.goal)
+        return jnp.concatenate([ranges, goal], axis=-1)
+
+
+class SkillQNetwork(nn.Module):
+    """The Skill Q-Network (paper eq. 1 to 6): GRU perception, skill decision, N latent skills."""
+
+    config: NetworkConfig
+    num_actions: int
+
+    @nn.compact
+    def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
+        """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
+        config = self.config
+        size, norm = config.hidden_size, config.layer_norm
+        features = Features(config, name="features")(obs)
+        carry, perception = GRU(size, name="perception")(features, carry)
+        decision = MLP(size, config.num_skills, norm, HEAD_SCALE, name="decision")(
+            perception + self._embedding("decision_embedding")
+        )
+        skill_weights = nn.softmax(decision, axis=-1)
+        skill_q_values = jnp.stack(
+            [
+                MLP(size, self.num_actions, norm, HEAD_SCALE, name=f"skill_{index}")(
+                    perception + self._embedding(f"skill_{index}_embedding")
+                )
+                for index in range(config.num_skills)
+            ],
+            axis=-2,
+        )
+        q_values = (skill_weights[..., None] * skill_q_values).sum(axis=-2)
+        return carry, QOutput(q_values, skill_weights, skill_q_values)
+
+    def _embedding(self, name: str) -> Array:
+        """A learnable module embedding [1, 1, H]; small at first, so that it does not drown z."""
+        size = self.config.hidden_size
+        return self.param(name, nn.initializers.normal(0.02), (size,))[None, None]
+
+
+class RecurrentQNetwork(nn.Module):
+    """The R2D2 baseline: the same perception, a single Q-head (section IV-E)."""
+
+    config: NetworkConfig
+    num_actions: int
+
+    @nn.compact
+    def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
+        """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
+        size, norm = self.config.hidden_size, self.config.layer_norm
+        features = Features(self.config, name="features")(obs)
+        carry, perception = GRU(size, name="perception")(features, carry)
+        q_values = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(perception)
+        return carry, _single_head(q_values)
+
+
+class FeedForwardQNetwork(nn.Module):
+    """The DQN baseline: no memory, the layers after the features three times as wide (IV-E)."""
+
+    config: NetworkConfig
+    num_actions: int
+
+    @nn.compact
+    def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
+        """Return the carry unchanged and the Q-values for observations [T, B, ...]."""
+        width = self.config.hidden_size * self.config.dqn_width_factor
+        features = Features(self.config, name="features")(obs)
+        hidden = _dense(width, "perception")(features)
+        if self.config.layer_norm:
+            hidden = _layer_norm("norm")(hidden)
+        head = MLP(width, self.num_actions, self.config.layer_norm, HEAD_SCALE, name="skill_0")
+        q_values = head(nn.relu(hidden))
+        return carry, _single_head(q_values)
+
+
+QNetwork = SkillQNetwork | RecurrentQNetwork | FeedForwardQNetwork
+
+_NETWORKS: dict[str, Callable[..., QNetwork]] = {
+    "sqn": SkillQNetwork,
+    "r2d2": RecurrentQNetwork,
+    "dqn": FeedForwardQNetwork,
+}
+
+
+def make_network(algo: Algorithm, config: NetworkConfig, num_actions: int) -> QNetwork:
+    """The network of an agent."""
+    return _NETWORKS[algo](config, num_actions)
+
+
+def initial_carry(config: NetworkConfig, batch_size: int) -> Array:
+    """The recurrent state [B, H] at the start of an episode: zero."""
+    return jnp.zeros((batch_size, config.hidden_size))
+
+
+def _single_head(q_values: Array) -> QOutput:
+    return QOutput(
+        q_values=q_values,
+        skill_weights=jnp.ones((*q_values.shape[:-1], 1)),
+        skill_q_values=q_values[..., None, :],
+    )
+
+
+class _Dense(nn.Module):
+    """A linear layer whose bias is broadcast explicitly, as strict rank promotion asks."""
+
+    size: int
+    scale: float
+
+    @nn.compact
+    def __call__(self, inputs: Array) -> Array:
+        initializer = nn.initializers.variance_scaling(self.scale**2, "fan_in", "truncated_normal")
+        kernel = self.param("kernel", initializer, (inputs.shape[-1], self.size))
+        bias = self.param("bias", _uniform_bias(inputs.shape[-1], self.scale), (self.size,))
+        return inputs @ kernel + jnp.expand_dims(bias, tuple(range(inputs.ndim - 1)))
+
+
+def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:
+    """Biases spread over +-scale / sqrt(fan_in), so that the ReLUs of few inputs bend apart."""
+    bound = scale / fan_in**0.5
+
+    def initialize(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return initialize
+
+
+def _dense(size: int, name: str, scale: float = 1.0) -> _Dense:
+    return _Dense(size, scale, name=name)
+
+
+def _layer_norm(name: str) -> nn.LayerNorm:
+    return nn.LayerNorm(name=name)

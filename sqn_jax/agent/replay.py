@@ -1,0 +1,128 @@
+"""A ring of whole episodes on the device, drawn by priority. It knows nothing of what it stores.
+
+Everything is a pure function of `ReplayState`. Episodes come in blocks of a fixed size that
+divides the capacity, so that a block is one contiguous write.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+
+@struct.dataclass
+class ReplayState:
+    """Stored items and their priorities."""
+
+    storage: Any
+    """A pytree of [capacity, ...] arrays."""
+    priorities: Array
+    """[capacity] float32, positive; 0 where nothing is stored."""
+    position: Array
+    """int32: where the next block goes."""
+    size: Array
+    """int32: items stored."""
+    max_priority: Array
+    """The largest priority seen, given to new items."""
+
+
+def init(example: Any, capacity: int) -> ReplayState:
+    """An empty replay for items shaped like `example`, a pytree of arrays or shape structs."""
+    return ReplayState(
+        storage=jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example),
+        priorities=jnp.zeros(capacity),
+        position=jnp.int32(0),
+        size=jnp.int32(0),
+        max_priority=jnp.float32(1.0),
+    )
+
+
+def num_bytes(example: Any, capacity: int) -> int:
+    """Memory that `init` would allocate, bytes."""
+    item = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(example))
+    return capacity * (item + 4) + 12
+
+
+def add(state: ReplayState, items: Any) -> ReplayState:
+    """Store a block of N items [N, ...], over the oldest once full; N divides the capacity."""
+    block = jax.tree.leaves(items)[0].shape[0]
+    capacity = state.priorities.shape[0]
+    if capacity % block:
+        raise ValueError(f"a block of {block} items does not divide the capacity {capacity}")
+    chex.assert_trees_all_equal_dtypes(state.storage, items)
+
+    def write(stored: Array, new: Array) -> Array:
+        return jax.lax.dynamic_update_slice_in_dim(stored, new, state.position, axis=0)
+
+    return state.replace(
+        storage=jax.tree.map(write, state.storage, items),
+        priorities=write(state.priorities, jnp.full(block, state.max_priority)),
+        position=(state.position + block) % capacity,
+        size=jnp.minimum(state.size + block, capacity),
+    )
+
+
+def probabilities(state: ReplayState, exponent: float) -> Array:
+    """Chance of each place to be drawn, [capacity]: proportional to priority ** exponent."""
+    stored = jnp.arange(state.priorities.shape[0]) < state.size
+    weights = jnp.where(stored, state.priorities**exponent, 0.0)
+    return weights / weights.sum()
+
+
+def sample(
+    key: Array,
+    state: ReplayState,
+    batch_size: int,
+    *,
+    priority_exponent: float,
+    importance_exponent: float,
+) -> tuple[Any, Array, Array]:
+    """Draw items with replacement (Schaul et al. 2016). The replay must not be empty.
+
+    Args:
+        key: consumed.
+        state: with at least one item.
+        batch_size: items to draw.
+        priority_exponent: 0 draws uniformly.
+        importance_exponent: 0 leaves the bias of prioritised drawing uncorrected.
+
+    Returns:
+        Items [B, ...], their places [B] int32, and importance weights [B] in (0, 1], scaled by
+        their largest.
+    """
+    chance = probabilities(state, priority_exponent)
+    cumulative = jnp.cumsum(chance)
+    draws = jax.random.uniform(key, (batch_size,)) * cumulative[-1]
+    places = jnp.searchsorted(cumulative, draws, side="right").astype(jnp.int32)
+    places = jnp.minimum(places, state.size - 1)
+    items = jax.tree.map(lambda x: x[places], state.storage)
+    weights = (state.size * chance[places]) ** -importance_exponent
+    return items, places, weights / weights.max()
+
+
+def update_priorities(state: ReplayState, places: Array, priorities: Array) -> ReplayState:
+    """Set the priorities [B] of places [B]; of a place drawn twice, one of the two holds."""
+    priorities = jnp.maximum(priorities, 1e-6)
+    return state.replace(
+        priorities=state.priorities.at[places].set(priorities),
+        max_priority=jnp.maximum(state.max_priority, priorities.max()),
+    )
+
+
+def sequence_priorities(td_errors: Array, max_weight: float) -> Array:
+    """Priority of sequences (R2D2, section 2.3): weight x max |d| + (1 - weight) x mean |d|.
+
+    Args:
+        td_errors: [T, B].
+        max_weight: in 0..1.
+
+    Returns:
+        [B].
+    """
+    magnitude = jnp.abs(td_errors)
+    return max_weight * magnitude.max(axis=0) + (1 - max_weight) * magnitude.mean(axis=0)

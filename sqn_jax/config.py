@@ -1,0 +1,426 @@
+"""Every setting of a run, as frozen dataclasses that check themselves, and the three presets.
+
+A config is static: it is hashable, decides shapes and branches, and is passed to jitted functions
+as a static argument. Numbers that one might sweep inside one program (speeds, noise, reward
+weights) are copied from `EnvConfig` into the traced `EnvParams` when an environment is made.
+
+The `paper` preset follows "Skill Q-Network: Learning Adaptive Skill Ensemble for Mapless
+Navigation in Unknown Environments", section IV-D; where the paper is silent, docs/ARCHITECTURE.md
+states the value chosen and why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+Algorithm = Literal["sqn", "r2d2", "dqn"]
+Method = Literal["r2d2", "pqn"]
+PresetName = Literal["quick", "paper", "smoke"]
+
+
+def _require(condition: bool, name: str, value: object, expected: str) -> None:
+    if not condition:
+        raise ValueError(f"{name} is {value!r}, expected {expected}")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The robot, its sensors and its reward (paper sections III-A, III-C, IV-A, IV-B)."""
+
+    num_beams: int = 71
+    """Range beams, evenly spaced over the field of view."""
+    field_of_view_deg: float = 350.0
+    """Angle from the first to the last beam, centred on the heading, degrees."""
+    max_range: float = 5.0
+    """Farthest range a beam reads, m."""
+    forward_speed: float = 2.5
+    """Speed of the action "forward", m/s."""
+    backward_speed: float = 1.25
+    """Speed of the action "backward", m/s, given as a positive number."""
+    turn_rate: float = math.pi
+    """Turn rate of the actions "turn left" and "turn right", rad/s."""
+    time_step: float = 0.1
+    """Seconds a step."""
+    robot_radius: float = 0.1
+    """Radius of the robot's body, m; 0 is a point."""
+    goal_radius: float = 0.3
+    """The goal counts as reached within this distance, m."""
+    max_goal_distance: float = 24.0
+    """Goal distance at which the normalised observation reaches 1, m (17 m x sqrt 2)."""
+    heading_encoding: Literal["linear", "sincos"] = "linear"
+    """Goal heading as one number (psi + pi) / 2 pi, or as sine and cosine scaled to 0..1."""
+    max_steps: int = 0
+    """Steps an episode; 0 takes the map's own limit (400, in the cave 1200)."""
+    coverage_cell: float = 0.34
+    """Side of the cells on which the covered area is counted, m."""
+    ray_sectors: int = 36
+    """Directions in the free-space table of the ray caster; a multiple of 4."""
+    ray_iterations: int = 7
+    """Free rectangles a ray may cross before its reading is cut short."""
+    velocity_noise: float = 0.0
+    """Sigma of Gaussian noise on the executed velocity."""
+    velocity_noise_unit: Literal["relative", "absolute"] = "relative"
+    """Sigma as a share of (forward_speed, turn_rate), or in m/s and rad/s."""
+    range_noise: float = 0.0
+    """Half-width p of the uniform noise on the observed ranges."""
+    range_noise_unit: Literal["relative", "absolute"] = "relative"
+    """Reading x (1 + U(-p, p)), or reading + max_range x U(-p, p)."""
+    reward_navigation: float = 2.0
+    """Weight of the reachability-aware navigation term (paper eq. 8)."""
+    reward_exploration: float = 1.0
+    """Weight of newly covered area, 1/m2 (paper eq. 6 and 8)."""
+    reward_time: float = 0.2
+    """Weight of the constant penalty of -1 a step (paper eq. 8)."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_range", "time_step", "goal_radius", "max_goal_distance", "coverage_cell"):
+            _require_positive(self, "env", name)
+        for name in ("forward_speed", "backward_speed", "turn_rate", "robot_radius"):
+            _require_not_negative(self, "env", name)
+        for name in ("velocity_noise", "range_noise"):
+            _require_not_negative(self, "env", name)
+        for name in ("reward_navigation", "reward_exploration", "reward_time"):
+            value = getattr(self, name)
+            _require(math.isfinite(value), f"env.{name}", value, "a finite number")
+        _require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
+        _require(
+            0 < self.field_of_view_deg < 360,
+            "env.field_of_view_deg",
+            self.field_of_view_deg,
+            "more than 0 and less than 360 degrees",
+        )
+        _require(self.max_steps >= 0, "env.max_steps", self.max_steps, "0 or a positive number")
+        _require(
+            self.ray_sectors >= 4 and self.ray_sectors % 4 == 0,
+            "env.ray_sectors",
+            self.ray_sectors,
+            "a positive multiple of 4",
+        )
+        _require(self.ray_iterations >= 1, "env.ray_iterations", self.ray_iterations, "at least 1")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the networks (paper section III-B and IV-D)."""
+
+    hidden_size: int = 128
+    """Width of every layer and of the GRU."""
+    num_skills: int = 2
+    """Latent skill policies N of the SQN."""
+    layer_norm: bool = False
+    """Layer normalisation before each ReLU; recurrent PQN needs it, the paper has none."""
+    dqn_width_factor: int = 3
+    """How much wider the DQN's layers after the features are (paper section IV-E)."""
+
+    def __post_init__(self) -> None:
+        for name in ("hidden_size", "num_skills", "dqn_width_factor"):
+            value = getattr(self, name)
+            _require(value >= 1, f"network.{name}", value, "at least 1")
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """Whole-episode replay with priorities (used by the method `r2d2`)."""
+
+    capacity: int = 10_000
+    """Episodes kept; the oldest make room for the newest."""
+    min_episodes: int = 100
+    """Updates begin once this many episodes are stored."""
+    prioritized: bool = True
+    """Draw sequences by priority; otherwise uniformly."""
+    priority_exponent: float = 0.9
+    """Exponent on the priorities when drawing (R2D2, table 2)."""
+    importance_exponent: float = 0.6
+    """Exponent of the importance-sampling weights (R2D2, table 2)."""
+    max_priority_weight: float = 0.9
+    """Priority of a sequence: this share of the largest TD error, the rest of the mean one."""
+
+    def __post_init__(self) -> None:
+        _require(self.capacity >= 1, "replay.capacity", self.capacity, "at least 1")
+        _require(
+            1 <= self.min_episodes <= self.capacity,
+            "replay.min_episodes",
+            self.min_episodes,
+            f"1 to replay.capacity ({self.capacity})",
+        )
+        for name in ("priority_exponent", "importance_exponent", "max_priority_weight"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, f"replay.{name}", value, "a number from 0 to 1")
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """The update rule. Fields used by one method only say so."""
+
+    batch_size: int = 64
+    """Whole episodes an update."""
+    learning_rate: float = 3e-4
+    """Adam's step size at the start."""
+    learning_rate_schedule: Literal["constant", "linear"] = "constant"
+    """Constant, or falling linearly to 0 over the run."""
+    adam_epsilon: float = 1e-5
+    """Adam's epsilon."""
+    max_grad_norm: float = 40.0
+    """Gradients are scaled down to this global norm."""
+    discount: float = 0.997
+    """Discount factor gamma."""
+    value_rescaling: bool = True
+    """Learn h(Q) instead of Q (R2D2, eq. 1)."""
+    n_step: int = 5
+    """r2d2: steps of reward before the bootstrap."""
+    double_q: bool = True
+    """r2d2: the online network picks the bootstrap action, the target network values it."""
+    burn_in_length: int = 10
+    """r2d2: steps at the start of a sequence that only warm up the recurrent state."""
+    target_update_rate: float = 0.002
+    """r2d2: Polyak coefficient tau of the target network."""
+    trace_decay: float = 0.8
+    """pqn: lambda of the Q(lambda) returns."""
+
+    def __post_init__(self) -> None:
+        for name in ("learning_rate", "adam_epsilon", "max_grad_norm"):
+            _require_positive(self, "learner", name)
+        for name in ("batch_size", "n_step"):
+            value = getattr(self, name)
+            _require(value >= 1, f"learner.{name}", value, "at least 1")
+        value = self.burn_in_length
+        _require(value >= 0, "learner.burn_in_length", value, "0 or a positive number")
+        for name in ("discount", "trace_decay"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
+        rate = self.target_update_rate
+        _require(0 < rate <= 1, "learner.target_update_rate", rate, "more than 0, at most 1")
+
+
+@dataclass(frozen=True)
+class ExplorationConfig:
+    """Epsilon-greedy exploration, falling linearly (paper section IV-D)."""
+
+    epsilon_start: float = 0.4
+    """Probability of a random action at the start."""
+    epsilon_end: float = 0.1
+    """Probability of a random action once it has fallen."""
+    decay_fraction: float = 1.0
+    """Share of the run over which epsilon falls."""
+    ladder: bool = False
+    """Give each parallel robot its own epsilon, evenly from 0 to 2 times the schedule's."""
+
+    def __post_init__(self) -> None:
+        for name in ("epsilon_start", "epsilon_end"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, f"exploration.{name}", value, "a number from 0 to 1")
+        value = self.decay_fraction
+        _require(0 < value <= 1, "exploration.decay_fraction", value, "more than 0, at most 1")
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """The evaluation that follows a training run."""
+
+    episodes: int = 100
+    """Greedy episodes from the evaluation points, and as many from random spawn pairs."""
+    seed: int = 1_000
+    """Seed of the starts and goals; independent of the training seed."""
+
+    def __post_init__(self) -> None:
+        _require(self.episodes >= 1, "eval.episodes", self.episodes, "at least 1")
+        _require(self.seed >= 0, "eval.seed", self.seed, "0 or a positive number")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    algo: Algorithm = "sqn"
+    """The agent, named as in the paper by its network."""
+    method: Method = "r2d2"
+    """How it learns: R2D2 with replay, or recurrent PQN on fresh episodes."""
+    map: str = "maze"
+    """A map of the project by name, or the path of a ROS map_server YAML file."""
+    seed: int = 0
+    """Seed of the first run."""
+    num_seeds: int = 1
+    """Runs trained side by side in one program, with seeds seed, seed + 1, ..."""
+    total_episodes: int = 10_000
+    """Training episodes of each run."""
+    num_envs: int = 50
+    """Robots that drive side by side; each round is one whole episode of all of them."""
+    updates_per_round: int = 50
+    """Updates after each round. pqn visits every episode of a round equally often."""
+    rounds_per_chunk: int = 1
+    """Rounds in one call of the compiled program; the host looks in between chunks."""
+    checkpoint_minutes: float = 10.0
+    """Minutes between checkpoints; one is always written at the end."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    eval: EvalConfig = field(default_factory=EvalConfig)
+
+    def __post_init__(self) -> None:
+        _require(self.algo in ("sqn", "r2d2", "dqn"), "algo", self.algo, "sqn, r2d2 or dqn")
+        _require(self.method in ("r2d2", "pqn"), "method", self.method, "r2d2 or pqn")
+        _require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
+        for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
+            value = getattr(self, name)
+            _require(value >= 1, name, value, "at least 1")
+        _require(
+            self.total_episodes >= self.num_envs,
+            "total_episodes",
+            self.total_episodes,
+            f"at least num_envs ({self.num_envs}), one round",
+        )
+        _require_positive(self, "", "checkpoint_minutes")
+        if self.method == "r2d2":
+            _require(
+                self.replay.capacity % self.num_envs == 0,
+                "replay.capacity",
+                self.replay.capacity,
+                f"a multiple of num_envs ({self.num_envs}), which are stored a round at a time",
+            )
+        else:
+            _require(
+                self.updates_per_round * self.learner.batch_size % self.num_envs == 0,
+                "updates_per_round",
+                self.updates_per_round,
+                "updates_per_round x learner.batch_size to be a multiple of num_envs "
+                f"({self.num_envs}), so that pqn sees every episode equally often",
+            )
+            _require(
+                self.num_envs % self.learner.batch_size == 0,
+                "learner.batch_size",
+                self.learner.batch_size,
+                f"a divisor of num_envs ({self.num_envs}) under the method pqn",
+            )
+
+    @property
+    def num_rounds(self) -> int:
+        """Rounds of the whole run; the last chunk may add a few to be full."""
+        rounds = math.ceil(self.total_episodes / self.num_envs)
+        return math.ceil(rounds / self.rounds_per_chunk) * self.rounds_per_chunk
+
+    @property
+    def num_chunks(self) -> int:
+        """Calls of the compiled program in the whole run."""
+        return self.num_rounds // self.rounds_per_chunk
+
+
+def _require_positive(config: object, group: str, name: str) -> None:
+    value = getattr(config, name)
+    label = f"{group}.{name}" if group else name
+    _require(math.isfinite(value) and value > 0, label, value, "a positive number")
+
+
+def _require_not_negative(config: object, group: str, name: str) -> None:
+    value = getattr(config, name)
+    _require(math.isfinite(value) and value >= 0, f"{group}.{name}", value, "0 or a positive number")
+
+
+def _quick() -> TrainConfig:
+    """Recurrent PQN within the budget of two CPU cores; docs/RESULTS.md has the measurements."""
+    return TrainConfig(
+        method="pqn",
+        total_episodes=56_320,
+        num_envs=256,
+        updates_per_round=16,
+        rounds_per_chunk=2,
+        network=NetworkConfig(layer_norm=True),
+        learner=LearnerConfig(
+            batch_size=16,
+            learning_rate=1e-3,
+            learning_rate_schedule="linear",
+            discount=0.99,
+        ),
+        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+    )
+
+
+def _smoke() -> TrainConfig:
+    """Every part of a run in less than a minute, without learning anything useful."""
+    return TrainConfig(
+        method="pqn",
+        total_episodes=64,
+        num_envs=16,
+        updates_per_round=2,
+        rounds_per_chunk=2,
+        env=EnvConfig(max_steps=60),
+        network=NetworkConfig(layer_norm=True),
+        replay=ReplayConfig(capacity=64, min_episodes=16),
+        learner=LearnerConfig(batch_size=8, learning_rate=1e-3, discount=0.99),
+        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+        eval=EvalConfig(episodes=8),
+    )
+
+
+PRESETS: dict[str, TrainConfig] = {"quick": _quick(), "paper": TrainConfig(), "smoke": _smoke()}
+"""`quick` is the default, `paper` follows the paper to the letter, `smoke` is for tests."""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return a config as nested plain dicts, ready for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
+    """Rebuild a config from `to_dict`'s output.
+
+    Raises:
+        ValueError: an unknown field, a value of the wrong type, or one out of range; the message
+            names the field.
+    """
+    _require(isinstance(data, dict), prefix.rstrip(".") or "config", data, "a mapping of fields")
+    known = {item.name: item for item in fields(cls)}
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for name, value in data.items():
+        _require(name in known, f"{prefix}{name}", value, f"one of the fields {sorted(known)}")
+        if dataclasses.is_dataclass(hints[name]):
+            value = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
+        else:
+            value = _checked(value, hints[name], f"{prefix}{name}")
+        values[name] = value
+    return cls(**values)
+
+
+def _checked(value: Any, hint: Any, label: str) -> Any:
+    """Check one leaf against its annotation; whole numbers pass where a float is asked for."""
+    if typing.get_origin(hint) is Literal:
+        options = typing.get_args(hint)
+        _require(value in options, label, value, f"one of {', '.join(map(str, options))}")
+        return value
+    assert not isinstance(hint, types.UnionType), "config fields have one type"
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    _require(type(value) is hint, label, value, f"a value of type {hint.__name__}")
+    return value
+
+
+def save(config: TrainConfig, path: Path) -> None:
+    """Write a config as JSON."""
+    path.write_text(json.dumps(to_dict(config), indent=2) + "\n", encoding="utf-8")
+
+
+def load(path: Path) -> TrainConfig:
+    """Read a config written by `save`.
+
+    Raises:
+        ValueError: the file is missing, is not JSON, or holds an unusable value.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not valid JSON ({error})") from None
+    try:
+        return typing.cast(TrainConfig, from_dict(data))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -1,0 +1,91 @@
+"""The table that makes exact ray casting cheap: free rectangles, one per cell and direction.
+
+For each cell and each sector of directions the table holds the width and height, in cells, of an
+empty rectangle that has the cell in one corner and reaches out towards the sector. A ray that
+starts anywhere in the cell may go straight to the rectangle's far side without a look at the
+cells between, and the place where it leaves is known to floating-point accuracy. A grid traversal
+needs a hundred steps for 5 m of 5 cm cells; hopping from rectangle to rectangle needs about four.
+
+Built on the host with NumPy, once for a map: 2 bytes x sectors x cells, 8 MB for 340 x 340.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDArray[np.uint16]:
+    """Build the table.
+
+    Args:
+        blocked: [H, W] cells a ray cannot enter; the border must be blocked.
+        sectors: directions told apart, a multiple of 4; sector s covers the angles
+            2 pi [s, s + 1) / sectors, counted from +x towards +y (increasing row).
+        reach: longest rectangle along the direction, cells, at most 250.
+
+    Returns:
+        [sectors, H, W], width + 256 * height; 0 in blocked cells, at least 1 x 1 in free ones.
+
+    Raises:
+        ValueError: `sectors` is not a multiple of 4, `reach` is out of range, or the border is
+            open, so that a ray could leave the map.
+    """
+    if sectors < 4 or sectors % 4:
+        raise ValueError(f"sectors is {sectors}, expected a positive multiple of 4")
+    if not 1 <= reach <= 250:
+        raise ValueError(f"reach is {reach} cells, expected 1 to 250")
+    border = (blocked[0], blocked[-1], blocked[:, 0], blocked[:, -1])
+    if not all(edge.all() for edge in border):
+        raise ValueError("the border of the map is open, expected it to be blocked")
+    per_quadrant = sectors // 4
+    table = np.empty((sectors, *blocked.shape), np.uint16)
+    for quadrant, (step_y, step_x) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
+        # Mirror the map so that the quadrant looks towards +x, +y, and mirror the result back.
+        mirrored = _Sums(blocked[::step_y, ::step_x], reach)
+        for offset in range(per_quadrant):
+            # In quadrants 1 and 3 the mirror image runs through the angles backwards.
+            position = per_quadrant - 1 - offset if quadrant % 2 else offset
+            slope = (position + 0.5) / per_quadrant * np.pi / 2
+            rectangles = mirrored.largest_free(np.cos(slope), np.sin(slope))
+            table[quadrant * per_quadrant + offset] = rectangles[::step_y, ::step_x]
+    return table
+
+
+class _Sums:
+    """Summed-area table of a blocked map, padded with blocked cells beyond the far sides."""
+
+    def __init__(self, blocked: NDArray[np.bool_], reach: int) -> None:
+        self.shape = blocked.shape
+        self.reach = reach
+        height, width = blocked.shape
+        padded = np.ones((height + reach + 2, width + reach + 2), np.int32)
+        padded[:height, :width] = blocked
+        self.sums = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int32)
+        np.cumsum(np.cumsum(padded, axis=0), axis=1, out=self.sums[1:, 1:])
+
+    def largest_free(self, cosine: float, sine: float) -> NDArray[np.uint16]:
+        """Largest free rectangle from each cell towards +x, +y with about the given slope.
+
+        The candidates of a direction are nested, so a binary search finds the largest.
+        """
+        lengths = np.arange(self.reach + 1)
+        # One cell more than the direction itself covers, since rays start anywhere in the cell.
+        slack = (lengths > 2).astype(np.int32)
+        widths = np.maximum(np.ceil(lengths * cosine).astype(np.int32) + slack, lengths > 0)
+        heights = np.maximum(np.ceil(lengths * sine).astype(np.int32) + slack, lengths > 0)
+        rows, columns = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.int32)
+        free = np.zeros(self.shape, np.int32)
+        blocked = np.full(self.shape, self.reach + 1, np.int32)
+        while (blocked - free > 1).any():
+            middle = np.minimum((free + blocked) // 2, self.reach)
+            top, right = rows + heights[middle], columns + widths[middle]
+            total = (
+                self.sums[top, right]
+                - self.sums[rows, right]
+                - self.sums[top, columns]
+                + self.sums[rows, columns]
+            )
+            free = np.where(total == 0, np.maximum(free, middle), free)
+            blocked = np.where(total == 0, blocked, np.minimum(blocked, middle))
+        return (widths[free] + 256 * heights[free]).astype(np.uint16)

@@ -1,0 +1,173 @@
+"""Mapless navigation as pure functions: `reset`, `reset_to`, `step`.
+
+A robot with range beams and the goal's distance and heading drives through an occupancy grid.
+
+Observation: `Observation(ranges [71], goal [2])`, every number in 0..1.
+Action: 0 stand still, 1 forward 2.5 m/s, 2 backward 1.25 m/s, 3 turn left pi rad/s, 4 turn right.
+Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 6 to 8).
+End: never terminated; truncated after `max_steps` steps. Reaching the goal does not end an
+episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
+
+Everything is for one robot; `jax.vmap` makes many. Positions are in metres from the map's lower
+left corner, headings in radians from +x towards +y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from sqn_jax.env import coverage, reward
+from sqn_jax.env.dynamics import move
+from sqn_jax.env.geometry import goal_in_robot_frame
+from sqn_jax.env.params import EnvParams, EnvState, Observation
+from sqn_jax.env.raycast import cast_rays
+
+NUM_ACTIONS = 5
+ACTION_NAMES = ("stand still", "forward", "backward", "turn left", "turn right")
+MOTION_ITERATIONS = 12
+"""Free rectangles the way of one step may cross; a longer way counts as blocked."""
+
+Info = dict[str, Array]
+
+
+def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
+    """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A)."""
+    start_key, goal_key, start_place_key, goal_place_key, heading_key = jax.random.split(key, 5)
+    num_points = params.spawn_counts.shape[0]
+    start_point = jax.random.randint(start_key, (), 0, num_points)
+    other = jax.random.randint(goal_key, (), 1, num_points)
+    goal_point = (start_point + other) % num_points
+    start = _place_near(start_place_key, start_point, params)
+    heading = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
+    return jnp.append(start, heading), _place_near(goal_place_key, goal_point, params)
+
+
+def _place_near(key: Array, point: Array, params: EnvParams) -> Array:
+    place = jax.random.randint(key, (), 0, params.spawn_counts[point])
+    return params.spawn_positions[point, place]
+
+
+def reset(key: Array, params: EnvParams) -> tuple[Observation, EnvState]:
+    """Start an episode at a random task; the key is consumed."""
+    task_key, noise_key = jax.random.split(key)
+    pose, goal = sample_task(task_key, params)
+    return reset_to(noise_key, pose, goal, params)
+
+
+def reset_to(
+    key: Array, pose: Array, goal: Array, params: EnvParams
+) -> tuple[Observation, EnvState]:
+    """Start an episode at a given pose [3] and goal [2]; what the first scan sees is no reward."""
+    ranges = true_ranges(pose, params)
+    covered, _ = _add_scan(coverage.empty(params.coverage_shape), pose, ranges, params)
+    state = EnvState(pose=pose, goal=goal, covered=covered, step=jnp.int32(0))
+    return observe(key, ranges, state, params), state
+
+
+def step(
+    key: Array, state: EnvState, action: Array, params: EnvParams
+) -> tuple[Observation, EnvState, Array, Array, Array, Info]:
+    """Advance by one time step.
+
+    Args:
+        key: consumed; only used for noise.
+        state: where the robot is.
+        action: integer in 0..4.
+        params: from `make_env`.
+
+    Returns:
+        Observation, state, reward, terminated (always False), truncated, and info: `reached`
+        (goal within `goal_radius`), `collision` (a refused move), `goal_distance` m,
+        `covered_area` m2 newly seen, and the unweighted reward terms `reward_navigation`,
+        `reward_exploration`, `reward_time`.
+    """
+    motion_key, reading_key = jax.random.split(key)
+    velocity = params.commands[action]
+    if params.config.velocity_noise > 0:
+        velocity = velocity + params.velocity_noise * jax.random.normal(motion_key, (2,))
+    pose, collision = move(
+        state.pose,
+        velocity,
+        params.body,
+        time_step=params.time_step,
+        iterations=MOTION_ITERATIONS,
+    )
+    ranges = true_ranges(pose, params)
+    covered, fresh_area = _add_scan(state.covered, pose, ranges, params)
+    new_state = EnvState(pose=pose, goal=state.goal, covered=covered, step=state.step + 1)
+
+    distance, heading = goal_in_robot_frame(pose, state.goal)
+    reachable = reward.goal_is_reachable(
+        distance, heading, ranges, field_of_view=field_of_view(params)
+    )
+    navigation = reward.navigation_reward(distance, reachable)
+    exploration = reward.exploration_reward(fresh_area)
+    time = reward.time_reward()
+    total = reward.total_reward(navigation, exploration, time, params.reward_weights)
+    info = {
+        "reached": distance < params.goal_radius,
+        "collision": collision,
+        "goal_distance": distance,
+        "covered_area": fresh_area,
+        "reward_navigation": navigation,
+        "reward_exploration": exploration,
+        "reward_time": jnp.float32(time),
+    }
+    terminated = jnp.bool_(False)
+    truncated = new_state.step >= params.max_steps
+    obs = observe(reading_key, ranges, new_state, params)
+    return obs, new_state, total, terminated, truncated, info
+
+
+def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Observation:
+    """Turn true readings [R] m and the goal into what the agent sees, with noise if configured."""
+    config = params.config
+    if config.range_noise > 0:
+        noise = params.range_noise * jax.random.uniform(key, ranges.shape, minval=-1.0)
+        if config.range_noise_unit == "relative":
+            ranges = ranges * (1 + noise)
+        else:
+            ranges = ranges + config.max_range * noise
+    distance, heading = goal_in_robot_frame(state.pose, state.goal)
+    scaled_distance = jnp.clip(distance / config.max_goal_distance, 0.0, 1.0)
+    if config.heading_encoding == "linear":
+        goal = jnp.stack([scaled_distance, (heading + jnp.pi) / (2 * jnp.pi)])
+    else:
+        sine, cosine = jnp.sin(heading), jnp.cos(heading)
+        goal = jnp.stack([scaled_distance, (1 + sine) / 2, (1 + cosine) / 2])
+    return Observation(ranges=jnp.clip(ranges / config.max_range, 0.0, 1.0), goal=goal)
+
+
+def true_ranges(pose: Array, params: EnvParams) -> Array:
+    """Noise-free readings [R] of all beams, m, from the rightmost to the leftmost."""
+    half = field_of_view(params) / 2
+    beams = jnp.linspace(-half, half, params.config.num_beams)
+    return cast_rays(
+        params.sight,
+        pose[:2],
+        pose[2] + beams,
+        max_range=params.config.max_range,
+        iterations=params.config.ray_iterations,
+    )
+
+
+def field_of_view(params: EnvParams) -> float:
+    """Angle from the first beam to the last, rad."""
+    return math.radians(params.config.field_of_view_deg)
+
+
+def _add_scan(
+    covered: Array, pose: Array, ranges: Array, params: EnvParams
+) -> tuple[Array, Array]:
+    return coverage.add_scan(
+        covered,
+        pose,
+        ranges,
+        field_of_view=field_of_view(params),
+        max_range=params.config.max_range,
+        cell=params.config.coverage_cell,
+    )

@@ -1,0 +1,70 @@
+"""What the simulator knows of a world: `EnvParams`, and its state `EnvState`."""
+
+from __future__ import annotations
+
+from flax import struct
+from jax import Array
+
+from sqn_jax.config import EnvConfig
+from sqn_jax.env.raycast import RayGrid
+
+
+@struct.dataclass
+class EnvParams:
+    """A map and a robot, on the device. Made by `make_env`.
+
+    All arrays are traced: a map of the same shape, another speed or another noise level is a
+    `replace` or a `vmap`, not a recompilation. `config` and `max_steps` are static.
+    """
+
+    sight: RayGrid
+    """The occupied cells, for range readings."""
+    body: RayGrid
+    """The cells the robot's centre may not enter, for collisions."""
+    spawn_positions: Array
+    """[S, M, 2] m: places to start or finish, grouped by spawn point, padded by repetition."""
+    spawn_counts: Array
+    """[S] int32: how many of the M places of a spawn point are real."""
+    commands: Array
+    """[5, 2] forward speed m/s and turn rate rad/s of each action."""
+    time_step: Array
+    """s."""
+    goal_radius: Array
+    """m."""
+    velocity_noise: Array
+    """[2] standard deviation of the noise on forward speed, m/s, and turn rate, rad/s."""
+    range_noise: Array
+    """Half-width of the uniform noise on the readings; see `EnvConfig.range_noise_unit`."""
+    reward_weights: Array
+    """[3] weights of navigation, exploration and time."""
+    config: EnvConfig = struct.field(pytree_node=False)
+    """The static settings this was made from."""
+    max_steps: int = struct.field(pytree_node=False)
+    """Steps an episode."""
+    coverage_shape: tuple[int, int] = struct.field(pytree_node=False)
+    """Rows and bytes a row of `EnvState.covered`."""
+
+
+@struct.dataclass
+class EnvState:
+    """The state of one episode."""
+
+    pose: Array
+    """[3] x m, y m, heading rad in [-pi, pi)."""
+    goal: Array
+    """[2] x m, y m."""
+    covered: Array
+    """[rows, bytes] uint8: the seen coverage cells, eight a byte."""
+    step: Array
+    """int32: steps taken."""
+
+
+@struct.dataclass
+class Observation:
+    """What the agent sees. Every number lies in 0..1."""
+
+    ranges: Array
+    """[R] readings over the maximal range, from the rightmost beam to the leftmost."""
+    goal: Array
+    """[2] goal distance over `max_goal_distance`, clipped, and heading (psi + pi) / 2 pi; or
+    [3] distance, (1 + sin psi) / 2, (1 + cos psi) / 2 with `heading_encoding="sincos"`."""

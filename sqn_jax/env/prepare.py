@@ -1,0 +1,131 @@
+"""From a map on the host to `EnvParams` on the device: the one place where env meets maps."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sqn_jax.config import EnvConfig
+from sqn_jax.env import coverage
+from sqn_jax.env.free_space import free_rectangles
+from sqn_jax.env.params import EnvParams
+from sqn_jax.env.raycast import RayGrid
+from sqn_jax.maps import OccupancyMap, connected_components, load_map, traversable, validate
+
+BODY_SECTORS = 8
+"""Directions in the table for collisions; a step is short, so a coarse table does."""
+
+
+def make_env(
+    name: str | Path | OccupancyMap,
+    config: EnvConfig | None = None,
+    *,
+    spawn: Literal["training", "evaluation"] = "training",
+) -> EnvParams:
+    """Load a map and prepare it for the simulator.
+
+    Args:
+        name: a map of the project ("maze"), the path of a ROS map_server YAML file, or a map.
+        config: the robot, sensors and reward; the paper's by default.
+        spawn: draw starts and goals near the map's spawn points, or at its evaluation points.
+
+    Returns:
+        The parameters that `reset` and `step` take.
+
+    Raises:
+        ValueError: the map is unusable; the message names the file and what was expected.
+
+    Example:
+        >>> params = make_env("maze")
+        >>> params.max_steps
+        400
+    """
+    config = EnvConfig() if config is None else config
+    if isinstance(name, OccupancyMap):
+        occupancy_map = name
+        validate(occupancy_map, config.robot_radius)
+    else:
+        occupancy_map = load_map(name, robot_radius=config.robot_radius)
+    body_free = traversable(occupancy_map.occupied, occupancy_map.resolution, config.robot_radius)
+    positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
+    speed = np.array([config.forward_speed, config.turn_rate], np.float32)
+    noise_unit = speed if config.velocity_noise_unit == "relative" else np.ones(2, np.float32)
+    longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
+    height_m, width_m = np.array(occupancy_map.occupied.shape) * occupancy_map.resolution
+    return EnvParams(
+        sight=_ray_grid(
+            occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
+        ),
+        body=_ray_grid(
+            ~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)
+        ),
+        spawn_positions=jnp.asarray(positions, jnp.float32),
+        spawn_counts=jnp.asarray(counts, jnp.int32),
+        commands=jnp.array(
+            [
+                [0.0, 0.0],
+                [config.forward_speed, 0.0],
+                [-config.backward_speed, 0.0],
+                [0.0, config.turn_rate],
+                [0.0, -config.turn_rate],
+            ],
+            jnp.float32,
+        ),
+        time_step=jnp.float32(config.time_step),
+        goal_radius=jnp.float32(config.goal_radius),
+        velocity_noise=jnp.asarray(config.velocity_noise * noise_unit, jnp.float32),
+        range_noise=jnp.float32(config.range_noise),
+        reward_weights=jnp.array(
+            [config.reward_navigation, config.reward_exploration, config.reward_time], jnp.float32
+        ),
+        config=config,
+        max_steps=config.max_steps or occupancy_map.max_steps,
+        coverage_shape=coverage.grid_shape(height_m, width_m, config.coverage_cell),
+    )
+
+
+def _ray_grid(
+    blocked: NDArray[np.bool_], resolution: float, sectors: int, reach_m: float
+) -> RayGrid:
+    reach = min(math.ceil(reach_m / resolution), 250)
+    height, width = blocked.shape
+    return RayGrid(
+        rectangles=jnp.asarray(free_rectangles(blocked, sectors, reach).reshape(-1)),
+        resolution=jnp.float32(resolution),
+        height=height,
+        width=width,
+        sectors=sectors,
+    )
+
+
+def _spawn_positions(
+    occupancy_map: OccupancyMap, body_free: NDArray[np.bool_], spawn: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Places around each point, [S, M, 2] m and how many are real, [S].
+
+    Places are centres of traversable cells within the spawn radius that lie in the connected
+    component of the point's own cell; at evaluation points only the point itself.
+    """
+    resolution = occupancy_map.resolution
+    labels, _ = connected_components(body_free)
+    if spawn == "evaluation":
+        return occupancy_map.evaluation_points[:, None, :], np.ones(
+            len(occupancy_map.evaluation_points), np.int64
+        )
+    groups = []
+    rows, columns = np.nonzero(body_free)
+    centres = (np.stack([columns, rows], axis=1) + 0.5) * resolution
+    for point in occupancy_map.spawn_points:
+        column, row = np.floor(point / resolution).astype(int)
+        near = np.hypot(*(centres - point).T) <= occupancy_map.spawn_radius
+        same = labels[rows, columns] == labels[row, column]
+        group = centres[near & same]
+        groups.append(group if len(group) else point[None])
+    counts = np.array([len(group) for group in groups])
+    positions = np.stack([np.resize(group, (counts.max(), 2)) for group in groups])
+    return positions, counts

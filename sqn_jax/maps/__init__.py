@@ -1,0 +1,32 @@
+"""Maps, on the host: occupancy grids, their files and their distance fields."""
+
+from sqn_jax.maps.check import describe
+from sqn_jax.maps.distance import goal_distance, obstacle_distance
+from sqn_jax.maps.occupancy import (
+    OccupancyMap,
+    cells_to_points,
+    connected_components,
+    points_to_cells,
+    reachable_cells,
+    sample_spawn_points,
+    traversable,
+    validate,
+)
+from sqn_jax.maps.ros import known_maps, load_map, save_map
+
+__all__ = [
+    "OccupancyMap",
+    "cells_to_points",
+    "connected_components",
+    "describe",
+    "goal_distance",
+    "known_maps",
+    "load_map",
+    "obstacle_distance",
+    "points_to_cells",
+    "reachable_cells",
+    "sample_spawn_points",
+    "save_map",
+    "traversable",
+    "validate",
+]

@@ -1,0 +1,99 @@
+"""A short report on a map, for a person who wants to know whether it will do."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sqn_jax.maps.distance import goal_distance
+from sqn_jax.maps.occupancy import (
+    OccupancyMap,
+    connected_components,
+    points_to_cells,
+    reachable_cells,
+    traversable,
+)
+
+_SHOWN_POINTS = 12
+
+
+def evaluation_distances(
+    occupancy_map: OccupancyMap, robot_radius: float = 0.1
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Geodesic and straight-line distance [E, E] in m between the evaluation points."""
+    points = occupancy_map.evaluation_points
+    free = reachable_cells(occupancy_map, robot_radius)
+    row, col = points_to_cells(points, occupancy_map.resolution).T
+    geodesic = goal_distance(free, occupancy_map.resolution, points)[:, row, col].T
+    straight = np.linalg.norm(points[:, None] - points[None, :], axis=-1)
+    return geodesic.astype(np.float64), straight
+
+
+def describe(
+    occupancy_map: OccupancyMap, robot_radius: float = 0.1, step_length: float = 0.25
+) -> str:
+    """A readable report of several lines: size, free space, points, distances, warnings.
+
+    Args:
+      occupancy_map: a map that `validate` accepts.
+      robot_radius: m; free space and distances are those of a robot of this size.
+      step_length: m driven in one step, to judge `max_steps`.
+    """
+    rows, cols = occupancy_map.shape
+    width, height = occupancy_map.size_m
+    free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
+    _, count = connected_components(free)
+    used = reachable_cells(occupancy_map, robot_radius)
+    x, y, yaw = occupancy_map.origin
+    lines = [
+        f"map            {occupancy_map.name}",
+        f"size           {width:.2f} x {height:.2f} m, "
+        f"{cols} x {rows} cells of {occupancy_map.resolution:g} m",
+        f"origin         ({x:g} m, {y:g} m), yaw {math.degrees(yaw):.1f} degrees",
+        f"free           {np.mean(~occupancy_map.occupied):.1%} of the cells, "
+        f"{free.mean():.1%} for a robot of radius {robot_radius:g} m",
+        f"components     {count}; the points lie in one with {used.sum() / free.sum():.1%} "
+        "of the free cells",
+        f"spawn points   {len(occupancy_map.spawn_points)}, "
+        f"starts within {occupancy_map.spawn_radius:g} m",
+        f"max steps      {occupancy_map.max_steps}",
+        f"evaluation     {len(occupancy_map.evaluation_points)} points",
+    ]
+    geodesic, straight = evaluation_distances(occupancy_map, robot_radius)
+    lines += _pair_lines(occupancy_map, geodesic, straight)
+    found = occupancy_map.warnings + _step_warnings(occupancy_map, geodesic, step_length)
+    lines += [f"warning        {line}" for line in found] or ["warnings       none"]
+    return "\n".join(lines)
+
+
+def _step_warnings(
+    occupancy_map: OccupancyMap, geodesic: NDArray[np.float64], step_length: float
+) -> tuple[str, ...]:
+    """A line if an episode is too short for the longest way between two evaluation points."""
+    steps = math.ceil(geodesic.max() / step_length)
+    if steps <= occupancy_map.max_steps:
+        return ()
+    return (
+        f"max_steps is {occupancy_map.max_steps}, but the longest way between evaluation points "
+        f"takes at least {steps} steps of {step_length:g} m",
+    )
+
+
+def _pair_lines(
+    occupancy_map: OccupancyMap, geodesic: NDArray[np.float64], straight: NDArray[np.float64]
+) -> list[str]:
+    """The evaluation points in the map frame, and a table of the ways between them."""
+    if len(occupancy_map.evaluation_points) > _SHOWN_POINTS:
+        return [f"               (more than {_SHOWN_POINTS}: distances not listed)"]
+    points = occupancy_map.to_map_frame(occupancy_map.evaluation_points)
+    lines = [f"  {i}            ({x:.2f}, {y:.2f}) m" for i, (x, y) in enumerate(points)]
+    lines.append("  pair         geodesic  straight  ratio")
+    for i, j in combinations(range(len(points)), 2):
+        # Two evaluation points in one place have no ratio.
+        ratio = geodesic[i, j] / straight[i, j] if straight[i, j] > 0 else math.nan
+        pair = f"{i} - {j}"
+        lines.append(f"  {pair:12} {geodesic[i, j]:6.2f} m  {straight[i, j]:6.2f} m  {ratio:5.2f}")
+    return lines

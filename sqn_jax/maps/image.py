@@ -1,0 +1,146 @@
+"""Map images: from the grey of a PNG or PGM file to occupied cells, as ROS map_server does it."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+MAX_PIXELS = 64 * 2**20
+MAX_IMAGE_BYTES = 512 * 2**20
+MODES = ("trinary", "scale", "raw")
+# See `suspicious_level`.
+_UNKNOWN_GREY = 205  # of 255
+_NEAR_THRESHOLD = 0.1
+_LARGE_SHARE = 0.2
+_UNKNOWN_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """How grey becomes occupancy: the keys of a map_server YAML file.
+
+    Attributes:
+      mode: trinary, scale or raw.
+      negate: True if white is occupied.
+      occupied_thresh: occupancy above this is occupied, 0..1.
+      free_thresh: occupancy below this is free, 0..1; between the two it is unknown.
+    """
+
+    mode: str = "trinary"
+    negate: bool = False
+    occupied_thresh: float = 0.65
+    free_thresh: float = 0.196
+
+
+@dataclass(frozen=True)
+class GreyImage:
+    """Decoded pixels: channel sums `level` [H, W] (row 0 at the top) of which `white` is white.
+
+    `opaque` is bool [H, W], or None for an image without an alpha channel.
+    """
+
+    level: NDArray[np.integer]
+    white: int
+    opaque: NDArray[np.bool_] | None
+
+
+def read_pixels(path: Path, mode: str) -> GreyImage:
+    """Decode a PNG or PGM file; colour is averaged, alpha too in trinary mode (as map_server does).
+
+    Raises:
+      ValueError: one line, without the file's name: not an image, too large, damaged.
+    """
+    data = path.read_bytes() if path.stat().st_size <= MAX_IMAGE_BYTES else b""
+    if not data:
+        raise ValueError(f"expected 1 to {MAX_IMAGE_BYTES} bytes, got {path.stat().st_size}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(data), formats=("PNG", "PPM")) as image:
+                width, height = image.size
+                if width * height > MAX_PIXELS:
+                    raise ValueError(f"{width} x {height} pixels, expected at most {MAX_PIXELS}")
+                return _to_grey(image, mode)
+        except UnidentifiedImageError as error:
+            raise ValueError("contents of another kind, expected a PNG or PGM image") from error
+        # Pillow's decoders raise a dozen kinds of error on damaged files: each means unusable.
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{reason}, expected a readable PNG or PGM image") from error
+
+
+def _to_grey(image: Image.Image, mode: str) -> GreyImage:
+    """Pixels of an open image of any supported kind."""
+    if image.mode in ("P", "PA"):
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    elif image.mode == "1":
+        image = image.convert("L")
+    if image.mode in ("I", "I;16", "I;16B", "I;16L"):
+        # 16 bits: read as numbers, since a conversion to 8 bits would clip at 255.
+        return GreyImage(np.asarray(image).astype(np.int64).clip(0, 65535), 65535, None)
+    if image.mode not in ("L", "LA", "RGB", "RGBA"):
+        raise ValueError(f"pixel type {image.mode!r}, expected grey, colour or palette")
+    pixels = np.asarray(image)
+    if pixels.ndim == 2:
+        return GreyImage(pixels, 255, None)
+    if image.mode == "RGB":
+        return GreyImage(pixels.sum(axis=-1, dtype=np.int32), 3 * 255, None)
+    opaque = pixels[..., -1] == 255
+    if mode != "trinary":
+        pixels = pixels[..., :-1]
+    return GreyImage(pixels.sum(axis=-1, dtype=np.int32), 255 * pixels.shape[-1], opaque)
+
+
+def level_occupancy(white: int, thresholds: Thresholds) -> NDArray[np.float64]:
+    """Occupancy of every grey level 0..white: 0..1, or above 1 where a raw level means unknown."""
+    levels = np.arange(white + 1)
+    if thresholds.mode == "raw":
+        # Raw images hold the percentage itself, whatever `negate` says; above 100 is unknown.
+        return np.round(levels * 255 / white) / 100
+    return (levels if thresholds.negate else white - levels) / white
+
+
+def occupied_cells(image: GreyImage, thresholds: Thresholds) -> NDArray[np.bool_]:
+    """Occupied cells [H, W] with row 0 at the BOTTOM: whatever is not free, unknown included.
+
+    A pixel is free if its occupancy is below `free_thresh`; in scale mode it must be opaque too.
+    """
+    free_level = level_occupancy(image.white, thresholds) < thresholds.free_thresh
+    free = free_level[image.level]
+    if thresholds.mode == "scale" and image.opaque is not None:
+        free &= image.opaque
+    return ~free[::-1]
+
+
+def suspicious_level(image: GreyImage, thresholds: Thresholds) -> str | None:
+    """One line about a grey level that probably means unknown and yet reads as free, else None.
+
+    Map files write unknown as grey 205, occupancy 0.196. A `free_thresh` above that makes all
+    unexplored ground free. Suspicious is the largest level, other than the freest one present,
+    whose occupancy is within 0.1 below `free_thresh`, if it fills more than a fifth of the free
+    space; for 205 itself a hundredth is enough, since little else is ever written so.
+    """
+    if thresholds.mode == "raw":
+        return None
+    occupancy = level_occupancy(image.white, thresholds)
+    pixels = np.bincount(image.level.ravel(), minlength=image.white + 1)
+    free = (occupancy < thresholds.free_thresh) & (pixels > 0)
+    near = free & (occupancy >= thresholds.free_thresh - _NEAR_THRESHOLD)
+    if not free.any() or not near.any():
+        return None
+    near &= occupancy > occupancy[free].min()
+    level = int(np.argmax(np.where(near, pixels, 0)))
+    share = pixels[level] / pixels[free].sum()
+    is_unknown_grey = round(level * 255 / image.white) == _UNKNOWN_GREY
+    if not near[level] or share <= (_UNKNOWN_SHARE if is_unknown_grey else _LARGE_SHARE):
+        return None
+    return (
+        f"grey {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {share:.0%} of "
+        f"the free space: if it means unknown, lower free_thresh from {thresholds.free_thresh:g}"
+    )

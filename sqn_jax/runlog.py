@@ -1,0 +1,115 @@
+"""A run folder: what a training run leaves on disk, and how it is read back.
+
+    config.json      every setting
+    metrics.jsonl    one object a chunk
+    checkpoints/     the state of the run
+    evaluation.json  statistics of the final evaluation; evaluation.jsonl has every episode
+    figures/*.png    learning curve, trajectories
+    summary.json     what it came to
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from sqn_jax import config as configs
+from sqn_jax.config import TrainConfig
+
+CONFIG = "config.json"
+METRICS = "metrics.jsonl"
+
+
+class RunFolder:
+    """Paths and files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.figures = path / "figures"
+
+    @classmethod
+    def create(cls, path: Path, config: TrainConfig) -> RunFolder:
+        """Make a folder for a new run and write its config.
+
+        Raises:
+            ValueError: the folder already holds a run, or cannot be written.
+        """
+        folder = cls(path)
+        if (path / CONFIG).exists():
+            raise ValueError(
+                f"run folder {path}: already holds a run; continue it with "
+                f"`sqn train --run-dir {path} --resume`, or name another folder"
+            )
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=path):
+                pass
+            _write_whole(path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
+        except OSError as error:
+            raise ValueError(f"run folder {path}: cannot be written ({error.strerror})") from None
+        return folder
+
+    @classmethod
+    def open(cls, path: Path) -> tuple[RunFolder, TrainConfig]:
+        """Open the folder of an earlier run.
+
+        Raises:
+            ValueError: it is no run folder, or its config is unusable.
+        """
+        if not (path / CONFIG).is_file():
+            raise ValueError(f"run folder {path}: holds no run, expected a {CONFIG} in it")
+        return cls(path), configs.load(path / CONFIG)
+
+    def append_metrics(self, row: Mapping[str, Any]) -> None:
+        """Add one line to metrics.jsonl; NaN becomes null."""
+        with (self.path / METRICS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(_without_nan(row), allow_nan=False) + "\n")
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """The rows of metrics.jsonl; a half-written last line is left out."""
+        path = self.path / METRICS
+        rows = []
+        if path.is_file():
+            for line in path.read_text(encoding="utf-8").splitlines():
+                try:
+                    rows.append(json.loads(line))
+                except json.JSONDecodeError:
+                    break
+        return rows
+
+    def keep_metrics(self, chunks: int) -> None:
+        """Drop the rows past `chunks` chunks, which a resumed run will write again."""
+        kept = [row for row in self.read_metrics() if row["chunk"] <= chunks]
+        _write_whole(self.path / METRICS, "".join(json.dumps(row) + "\n" for row in kept))
+
+    def write_json(self, name: str, data: Mapping[str, Any]) -> None:
+        """Write a JSON file as a whole or not at all."""
+        text = json.dumps(_without_nan(data), indent=2, allow_nan=False)
+        _write_whole(self.path / name, text + "\n")
+
+    def write_records(self, name: str, records: Iterable[Mapping[str, Any]]) -> None:
+        """Write a JSON lines file as a whole or not at all."""
+        lines = [json.dumps(_without_nan(record), allow_nan=False) + "\n" for record in records]
+        _write_whole(self.path / name, "".join(lines))
+
+
+def _write_whole(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def _without_nan(value: Any) -> Any:
+    """Replace what JSON cannot say: NaN and infinities become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return value

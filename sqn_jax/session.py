@@ -1,0 +1,331 @@
+"""A whole training run as a person starts it: folder, progress, checkpoints, evaluation, figures.
+
+The numbers come from `train` and `evaluate`; this module decides what is said and written when.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import sqn_jax
+from sqn_jax import evaluate
+from sqn_jax.checkpoint import Checkpoints
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import EnvParams, make_env
+from sqn_jax.maps import OccupancyMap, load_map
+from sqn_jax.rollout import EpisodeSummary, Trace
+from sqn_jax.runlog import RunFolder
+from sqn_jax.train import ChunkReport, RunnerState, memory_bytes, run, start_run
+
+TASKS = {"evaluation points": "evaluation", "random pairs": "training"}
+"""What the final evaluation is done on, and the spawn mode that draws it."""
+
+
+class Stopped(Exception):  # noqa: N818
+    """The run was stopped by a signal, after saving; carries the exit code."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal_number)
+        self.exit_code = 128 + signal_number
+
+
+def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> None:
+    """Train, evaluate and draw, telling the terminal about it.
+
+    Args:
+        config: the settings; of a resumed run those in its folder.
+        run_dir: where everything goes.
+        resume: go on from the newest checkpoint in `run_dir`.
+
+    Raises:
+        ValueError: the map or the folder is unusable.
+        Stopped: by SIGINT or SIGTERM, after the chunk was finished and saved.
+    """
+    occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
+    env_params = make_env(occupancy_map, config.env)
+    folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
+    _announce(config, env_params, run_dir)
+    with Checkpoints(run_dir) as checkpoints:
+        runner, seconds_before = _first_state(config, env_params, folder, checkpoints, resume)
+        runner, timing = _train(runner, env_params, config, folder, checkpoints, seconds_before)
+    results = _evaluate(runner, occupancy_map, config, folder)
+    figures = _draw(results, occupancy_map, config, folder)
+    _conclude(results, timing, figures, config, folder)
+
+
+def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path) -> None:
+    device = jax.devices()[0]
+    seeds = f"seed {config.seed}"
+    if config.num_seeds > 1:
+        seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
+    episodes = config.num_rounds * config.num_envs
+    print(
+        f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
+        f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
+        f"run folder {run_dir}, device {device.platform} ({device.device_kind}), "
+        f"episodes in memory {memory_bytes(config, env_params) / 1e6:,.0f} MB"
+    )
+
+
+def _first_state(
+    config: TrainConfig,
+    env_params: EnvParams,
+    folder: RunFolder,
+    checkpoints: Checkpoints,
+    resume: bool,
+) -> tuple[RunnerState, float]:
+    """The state to go on from, and the seconds of training already behind it."""
+    if not resume:
+        return start_run(env_params, config), 0.0
+    runner = checkpoints.restore(jax.eval_shape(start_run, env_params, config=config))
+    chunks = int(np.max(np.asarray(runner.round))) // config.rounds_per_chunk
+    folder.keep_metrics(chunks)
+    rows = folder.read_metrics()
+    print(f"resuming after {chunks} of {config.num_chunks} chunks")
+    return runner, float(rows[-1]["wall_seconds"]) if rows else 0.0
+
+
+def _train(
+    runner: RunnerState,
+    env_params: EnvParams,
+    config: TrainConfig,
+    folder: RunFolder,
+    checkpoints: Checkpoints,
+    seconds_before: float,
+) -> tuple[RunnerState, dict[str, float]]:
+    """Drive the training to its end; returns the final state and how long it took."""
+    timing = {"compile_seconds": 0.0, "train_seconds": seconds_before, "env_steps": 0.0}
+    last_saved, chunk = time.monotonic(), 0
+    episodes_a_chunk = config.rounds_per_chunk * config.num_envs
+    print("compiling ...", end="", flush=True)
+    with _signals() as received, _bar(config) as bar:
+        for runner, report in run(runner, env_params, config):  # noqa: B020
+            if chunk == 0:
+                tqdm.write(f"\rcompiled in {report.compile_seconds:.1f} s", file=sys.stdout)
+                bar.reset(total=config.num_chunks * episodes_a_chunk)
+                bar.update((report.chunk - 1) * episodes_a_chunk)
+                bar.initial = bar.n
+            chunk = report.chunk
+            timing["compile_seconds"] += report.compile_seconds
+            timing["train_seconds"] += report.seconds
+            timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
+            row = _row(report, timing["train_seconds"], env_params, config)
+            folder.append_metrics(row)
+            bar.set_postfix_str(_postfix(row), refresh=False)
+            bar.update(episodes_a_chunk)
+            if received or time.monotonic() - last_saved > 60 * config.checkpoint_minutes:
+                checkpoints.save(chunk, runner)
+                last_saved = time.monotonic()
+            if received:
+                raise Stopped(received[0])
+    if checkpoints.latest() != config.num_chunks:
+        checkpoints.save(config.num_chunks, runner)
+    return runner, timing
+
+
+def _bar(config: TrainConfig) -> tqdm[Any]:
+    return tqdm(
+        unit=" episodes",
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        smoothing=0.1,
+        dynamic_ncols=True,
+        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
+        "[{elapsed}, {remaining} left{postfix}]",
+        disable=None if config.total_episodes == 0 else False,
+    )
+
+
+def _row(
+    report: ChunkReport, train_seconds: float, env_params: EnvParams, config: TrainConfig
+) -> dict[str, Any]:
+    """One line of metrics.jsonl."""
+    rounds = report.chunk * config.rounds_per_chunk
+    episodes = rounds * config.num_envs
+    steps = config.rounds_per_chunk * config.num_envs * config.num_seeds * env_params.max_steps
+    return {
+        "chunk": report.chunk,
+        "episodes": episodes,
+        "env_steps": episodes * env_params.max_steps,
+        "wall_seconds": round(train_seconds, 3),
+        "steps_per_second": round(steps / report.seconds),
+        **report.metrics,
+    }
+
+
+def _postfix(row: dict[str, Any]) -> str:
+    return (
+        f"success {np.mean(row['success']):.2f}, reward {np.mean(row['mean_reward']):+.2f}, "
+        f"{row['steps_per_second']:,} steps/s"
+    )
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM instead of dying of them; a second one ends at once."""
+    received: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        tqdm.write("\nstopping after this chunk; once more to stop at once", file=sys.stderr)
+        for each in previous:
+            signal.signal(each, signal.SIG_DFL)
+
+    previous = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for each, handler in previous.items():
+            signal.signal(each, handler)
+
+
+Results = dict[str, list[tuple[EpisodeSummary, Trace]]]
+"""For each kind of task, one summary and trace a training seed."""
+
+
+def _evaluate(
+    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+) -> Results:
+    """Greedy episodes of every seed from the evaluation points and from random pairs."""
+    params = runner.learner.params
+    seeds = [params]
+    if config.num_seeds > 1:
+        seeds = [evaluate.select_seed(params, index) for index in range(config.num_seeds)]
+    results: Results = {}
+    entries, records = [], []
+    for number, (tasks, spawn) in enumerate(TASKS.items()):
+        env_params = make_env(occupancy_map, config.env, spawn=spawn)  # type: ignore[arg-type]
+        key = jax.random.fold_in(jax.random.key(config.eval.seed), number)
+        results[tasks] = [
+            jax.device_get(
+                evaluate.run_episodes(
+                    key,
+                    one,
+                    env_params,
+                    algo=config.algo,
+                    network_config=config.network,
+                    num_episodes=config.eval.episodes,
+                )
+            )
+            for one in seeds
+        ]
+        entries.append(_entry(tasks, results[tasks], config))
+        records += _records(tasks, results[tasks], config)
+    folder.write_json("evaluation.json", {"schema": 1, "results": entries})
+    folder.write_records("evaluation.jsonl", records)
+    return results
+
+
+def _entry(
+    tasks: str, results: list[tuple[EpisodeSummary, Trace]], config: TrainConfig
+) -> dict[str, Any]:
+    return {
+        "algorithm": config.algo,
+        "map": config.map,
+        "tasks": tasks,
+        "velocity_noise": config.env.velocity_noise,
+        "range_noise": config.env.range_noise,
+        "goal_radius": config.env.goal_radius,
+        "training_seeds": [config.seed + index for index in range(config.num_seeds)],
+        "episodes": config.eval.episodes,
+        **evaluate.aggregate([summary for summary, _ in results]),
+    }
+
+
+def _records(
+    tasks: str, results: list[tuple[EpisodeSummary, Trace]], config: TrainConfig
+) -> Iterator[dict[str, Any]]:
+    """One object an episode."""
+    for index, (summary, trace) in enumerate(results):
+        for episode in range(config.eval.episodes):
+            yield {
+                "tasks": tasks,
+                "training_seed": config.seed + index,
+                "episode": episode,
+                "start": trace.poses[0, episode].tolist(),
+                "goal": trace.goals[episode].tolist(),
+                "success": bool(summary.success[episode]),
+                "time_steps": int(summary.time_steps[episode]),
+                "mean_reward": float(summary.mean_reward[episode]),
+                "collisions": int(summary.collisions[episode]),
+                "coverage_m2": float(summary.covered_area[episode]),
+                "path_length_m": float(summary.path_length[episode]),
+            }
+
+
+def _draw(
+    results: Results, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+) -> bool:
+    """Write the figures; says so and returns False where Matplotlib is not installed."""
+    try:
+        from sqn_jax import figures
+    except ImportError:
+        print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
+        return False
+    name = f"{config.algo.upper()} on {occupancy_map.name}"
+    curve = figures.learning_curve(folder.read_metrics(), title=name)
+    figures.save(curve, folder.figures / "learning_curve.png")
+    for tasks, outcomes in results.items():
+        summary, trace = outcomes[0]
+        drawing = figures.trajectories(
+            occupancy_map,
+            trace.goals,
+            trace.poses,
+            trace.skill_weights,
+            summary.success,
+            summary.time_steps,
+            goal_radius=config.env.goal_radius,
+            robot_radius=config.env.robot_radius,
+            title=f"{name}, {tasks}" + (f", seed {config.seed}" if config.num_seeds > 1 else ""),
+        )
+        figures.save(drawing, folder.figures / f"trajectories_{tasks.replace(' ', '_')}.png")
+    return True
+
+
+def _conclude(
+    results: Results,
+    timing: dict[str, float],
+    figures: bool,
+    config: TrainConfig,
+    folder: RunFolder,
+) -> None:
+    """Write summary.json and say what it came to."""
+    device = jax.devices()[0]
+    summary: dict[str, Any] = {
+        "episodes": config.num_rounds * config.num_envs,
+        "wall_seconds": round(timing["train_seconds"], 1),
+        "compile_seconds": round(timing["compile_seconds"], 1),
+        "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
+        "device": f"{device.platform} ({device.device_kind})",
+        "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
+    }
+    print(
+        f"trained in {summary['wall_seconds'] / 60:.1f} min "
+        f"({summary['steps_per_second']:,} steps a second)"
+    )
+    for tasks, outcomes in results.items():
+        entry = evaluate.aggregate([outcome for outcome, _ in outcomes])
+        summary[tasks.replace(" ", "_")] = {
+            "success": entry["success"]["mean"],
+            "time_steps": entry["time_steps"]["mean"],
+        }
+        low, high = entry["success"]["ci95"]
+        print(
+            f"{tasks + ':':19} success {entry['success']['mean']:.2f} "
+            f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
+            f"({config.eval.episodes} greedy episodes"
+            + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
+        )
+    folder.write_json("summary.json", summary)
+    if figures:
+        print(f"figures in {folder.figures}")

@@ -1,0 +1,201 @@
+"""Training: one compiled program that scans over rounds of rollout and learning.
+
+`train_chunk` is the device program; `run` drives it chunk by chunk and hands numbers to the host
+in between. Files, bars and pictures stand outside, in whoever consumes the generator.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax import Array
+
+from sqn_jax.agent import pqn, r2d2, replay
+from sqn_jax.agent.experience import Episodes
+from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
+from sqn_jax.agent.learner import LearnerState, init_learner, make_optimizer
+from sqn_jax.agent.networks import QNetwork, make_network
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import NUM_ACTIONS, EnvParams
+from sqn_jax.rollout import reset_all, summarize, unroll
+
+
+@struct.dataclass
+class RunnerState:
+    """Everything a run needs to go on; with several seeds, each array has a leading axis [K]."""
+
+    learner: LearnerState
+    """Parameters and optimiser."""
+    memory: Any
+    """Replay of the method `r2d2`; None for `pqn`."""
+    key: Array
+    """Randomness still to come."""
+    round: Array
+    """int32: rounds done."""
+
+
+def network_of(config: TrainConfig) -> QNetwork:
+    """The network a config asks for."""
+    return make_network(config.algo, config.network, NUM_ACTIONS)
+
+
+def optimizer_of(config: TrainConfig) -> optax.GradientTransformation:
+    """The optimiser a config asks for."""
+    return make_optimizer(config.learner, config.num_rounds * config.updates_per_round)
+
+
+def episode_shapes(config: TrainConfig, env_params: EnvParams) -> Episodes:
+    """Shapes and dtypes of a round of episodes, without computing anything."""
+    network = network_of(config)
+
+    def one_round(key: Array) -> Episodes:
+        start = reset_all(key, config.num_envs, env_params)
+        obs = jax.tree.map(lambda x: x[None], start[0])
+        learner = init_learner(key, network, optimizer_of(config), obs, use_target=False)
+        epsilon = jnp.zeros(config.num_envs)
+        return unroll(key, network, learner.params, start, epsilon, env_params)[0]
+
+    return jax.eval_shape(one_round, jax.random.key(0))
+
+
+def memory_bytes(config: TrainConfig, env_params: EnvParams) -> int:
+    """Bytes that the replay of all seeds and the episodes of a round will take."""
+    episodes = episode_shapes(config, env_params)
+    total = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(episodes))
+    if config.method == "r2d2":
+        total += replay.num_bytes(r2d2.packed_item(episodes), config.replay.capacity)
+    return config.num_seeds * total
+
+
+def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> RunnerState:
+    """The state of one run before its first round; the key is consumed."""
+    learner_key, obs_key, run_key = jax.random.split(key, 3)
+    obs, _ = reset_all(obs_key, config.num_envs, env_params)
+    learner = init_learner(
+        learner_key,
+        network_of(config),
+        optimizer_of(config),
+        jax.tree.map(lambda x: x[None], obs),
+        use_target=config.method == "r2d2",
+    )
+    memory = None
+    if config.method == "r2d2":
+        item = r2d2.packed_item(episode_shapes(config, env_params))
+        memory = replay.init(item, config.replay.capacity)
+    return RunnerState(learner=learner, memory=memory, key=run_key, round=jnp.int32(0))
+
+
+def train_round(
+    runner: RunnerState, _: None, *, env_params: EnvParams, config: TrainConfig
+) -> tuple[RunnerState, dict[str, Array]]:
+    """One whole episode of all robots, then the updates; returns scalars to log."""
+    key, reset_key, unroll_key, learn_key = jax.random.split(runner.key, 4)
+    network = network_of(config)
+    progress = runner.round / config.num_rounds
+    epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
+    start = reset_all(reset_key, config.num_envs, env_params)
+    episodes, trace = unroll(
+        unroll_key, network, runner.learner.params, start, epsilon, env_params
+    )
+    summary = summarize(episodes, trace, env_params.goal_radius)
+    learn = r2d2.learn if config.method == "r2d2" else pqn.learn
+    learner, memory, learning = learn(
+        learn_key, runner.learner, runner.memory, episodes, network, optimizer_of(config), config
+    )
+    metrics = {
+        "mean_reward": summary.mean_reward.mean(),
+        "success": summary.success.mean(),
+        "time_steps": summary.time_steps.mean(),
+        "collisions": summary.collisions.mean(),
+        "covered_area": summary.covered_area.mean(),
+        "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
+        "epsilon": epsilon_schedule(progress, config.exploration),
+        **learning,
+    }
+    new_runner = RunnerState(learner=learner, memory=memory, key=key, round=runner.round + 1)
+    return new_runner, metrics
+
+
+def train_chunk(
+    runner: RunnerState, env_params: EnvParams, config: TrainConfig
+) -> tuple[RunnerState, dict[str, Array]]:
+    """Scan over `rounds_per_chunk` rounds; nothing returns to the host in between.
+
+    Args:
+        runner: donated; with `num_seeds` > 1 every array has a leading axis [K].
+        env_params: the world, shared by all seeds.
+        config: static.
+
+    Returns:
+        The new state and metrics [rounds] ([K, rounds] for several seeds).
+    """
+
+    def scan(one: RunnerState) -> tuple[RunnerState, dict[str, Array]]:
+        body = partial(train_round, env_params=env_params, config=config)
+        return jax.lax.scan(body, one, None, length=config.rounds_per_chunk)
+
+    return scan(runner) if config.num_seeds == 1 else jax.vmap(scan)(runner)
+
+
+compiled_train_chunk = jax.jit(train_chunk, static_argnames="config", donate_argnames="runner")
+
+
+@partial(jax.jit, static_argnames="config")
+def start_run(env_params: EnvParams, config: TrainConfig) -> RunnerState:
+    """State of a new run: seed `config.seed`, or several with consecutive seeds side by side.
+
+    Run i of several has the same key as a single run with seed `config.seed + i`.
+    """
+    if config.num_seeds == 1:
+        return init_runner(jax.random.key(config.seed), env_params, config)
+    keys = jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
+    return jax.vmap(lambda key: init_runner(key, env_params, config))(keys)
+
+
+@dataclass(frozen=True)
+class ChunkReport:
+    """What one chunk did."""
+
+    chunk: int
+    """Chunks done, from 1."""
+    metrics: dict[str, Any]
+    """Means over the chunk's rounds; a list with one number a seed where there are several."""
+    compile_seconds: float
+    """Time spent compiling before the first chunk of this process, else 0."""
+    seconds: float
+    """Time the chunk ran."""
+
+
+def run(
+    runner: RunnerState, env_params: EnvParams, config: TrainConfig
+) -> Iterator[tuple[RunnerState, ChunkReport]]:
+    """Train chunk by chunk from any state to the end, yielding after each.
+
+    The yielded state is donated to the next chunk: use it before asking for the next one.
+    """
+    started = time.perf_counter()
+    program = compiled_train_chunk.lower(runner, env_params, config).compile()
+    compile_seconds = time.perf_counter() - started
+    rounds_done = int(np.max(np.asarray(runner.round)))
+    for chunk in range(rounds_done // config.rounds_per_chunk + 1, config.num_chunks + 1):
+        started = time.perf_counter()
+        runner, metrics = program(runner, env_params)
+        host_metrics = jax.device_get(metrics)
+        seconds = time.perf_counter() - started
+        yield runner, ChunkReport(chunk, _average(host_metrics, config), compile_seconds, seconds)
+        compile_seconds = 0.0
+
+
+def _average(metrics: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
+    """Mean over the rounds of a chunk, as plain numbers (lists over seeds, lists over skills)."""
+    axis = 0 if config.num_seeds == 1 else 1
+    return {name: np.mean(value, axis=axis).tolist() for name, value in metrics.items()}

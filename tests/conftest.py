@@ -1,0 +1,26 @@
+"""What holds for every test: the CPU, no silent broadcasting, the same examples in every run."""
+
+from __future__ import annotations
+
+import os
+
+# Before anything imports jax, and in the environment, so that child processes obey too.
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["JAX_ENABLE_X64"] = "0"
+
+import hypothesis
+import jax
+
+# [T] + [N, T] broadcasts to something that looks right and is not: make every such case spell
+# out what it means.
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# No deadline: the first call of a jitted function compiles it.
+hypothesis.settings.register_profile(
+    "deterministic",
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("deterministic")

@@ -1,0 +1,53 @@
+"""The text maps of the MovingAI benchmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sqn_jax.maps import load_map
+
+SOUND = "type octile\nheight 5\nwidth 7\nmap\nTTTTTTT\n@....W@\n@GSO..@\n@.....@\n@@@@@@@\n"
+
+
+def test_letters_become_cells_with_the_last_line_at_the_bottom(tmp_path: Path) -> None:
+    path = tmp_path / "small.map"
+    path.write_bytes(SOUND.replace("\n", "\r\n").encode())
+    loaded = load_map(path)
+    expected = ["1111111", "1000001", "1001001", "1000011", "1111111"]
+    assert ["".join("01"[int(cell)] for cell in row) for row in loaded.occupied] == expected
+    assert (loaded.name, loaded.resolution, loaded.size_m) == ("small", 1.0, (7.0, 5.0))
+    assert loaded.occupied.dtype == np.bool_
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("octile", "tile", "octile"),
+        ("height 5", "height five", "height"),
+        ("height 5", "height", "line 2"),
+        ("width 7", "width 0", "width"),
+        ("width 7", "width 8", "5 lines of 8"),
+        ("height 5", "height 6", "6 lines of 7"),
+        ("map\n", "", "header"),
+        ("GSO", "GxO", "letter"),
+        ("@GSO..@\n", "@GSO.@\n", "lines of 7"),
+        (SOUND, "", "header"),
+        (".", "@", "no free space"),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path = tmp_path / "bad.map"
+    text = SOUND.replace(old, new)
+    path.write_text(text.replace("G", "@").replace("S", "@") if words == "no free space" else text)
+    with pytest.raises(ValueError, match=r"bad\.map: ") as caught:
+        load_map(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such file"):
+        load_map(tmp_path / "absent.map")

@@ -1,0 +1,227 @@
+"""The conventions of ROS map_server, on files written here byte by byte."""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from map_files import pgm_bytes
+from PIL import Image
+
+from sqn_jax.maps import OccupancyMap, load_map, save_map
+
+Room = Callable[..., Path]
+
+
+def blocks(*greys: int, dtype: type = np.uint8) -> np.ndarray:
+    """An image of 20 rows with one band of 30 columns for each grey, left to right."""
+    return np.repeat(np.array([greys], dtype=dtype), 30, axis=1).repeat(20, axis=0)
+
+
+def free_bands(path: Path, count: int) -> list[bool]:
+    """Whether each band of `blocks` is free, read in the middle of the band."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        occupied = load_map(path).occupied
+    assert occupied.shape == (20, 30 * count)
+    return [not occupied[10, 30 * band + 15] for band in range(count)]
+
+
+def png_bytes(pixels: np.ndarray, mode: str | None = None) -> bytes:
+    buffer = io.BytesIO()
+    image = Image.fromarray(pixels)
+    (image if mode is None else image.convert(mode)).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def test_the_top_row_of_the_image_is_the_north_edge(room: Room) -> None:
+    grey = np.full((20, 50), 254, dtype=np.uint8)
+    grey[3, 40] = 0
+    loaded = load_map(room(grey=grey))
+    inside = np.argwhere(loaded.occupied[1:-1, 1:-1]) + 1
+    assert inside.tolist() == [[16, 40]]
+
+
+def test_the_border_is_closed(room: Room) -> None:
+    occupied = load_map(room()).occupied
+    assert occupied.shape == (90, 120)
+    assert occupied[[0, -1]].all()
+    assert occupied[:, [0, -1]].all()
+    assert not occupied[1:-1, 1:-1].any()
+
+
+def test_points_are_given_in_the_map_frame(room: Room) -> None:
+    # Turned by 90 degrees about the lower-left corner at (10, 20): grid (x, y) -> (10 - y, 20 + x).
+    path = room(
+        origin=f"[10.0, 20, {math.pi / 2!r}]",
+        spawn_points="[[9.0, 22.0], [5.0, 30.0]]",
+        evaluation_points="[[9.0, 22.0], [9, 22.5], [7.0, 21.0]]",
+    )
+    loaded = load_map(path)
+    np.testing.assert_allclose(loaded.spawn_points, [[2.0, 1.0], [10.0, 5.0]])
+    np.testing.assert_allclose(loaded.evaluation_points, [[2.0, 1.0], [2.5, 1.0], [1.0, 3.0]])
+    assert loaded.origin == (10.0, 20.0, math.pi / 2)
+
+
+def test_the_own_keys_have_defaults_and_are_read(room: Room) -> None:
+    plain = load_map(room())
+    assert (plain.max_steps, plain.spawn_radius) == (400, 0.5)
+    assert len(plain.spawn_points) == 16
+    assert len(plain.evaluation_points) == 4
+    changed = load_map(room(max_steps="1200", spawn_radius="0.25"))
+    assert (changed.max_steps, changed.spawn_radius) == (1200, 0.25)
+    assert plain.name == "room"
+    assert plain.resolution == 0.1
+
+
+def test_numbers_may_be_written_in_any_usual_way(room: Room) -> None:
+    assert load_map(room(resolution="1e-1")).resolution == 0.1
+    assert load_map(room(resolution='"+.1"', max_steps="4e2")).max_steps == 400
+
+
+# (255 - 205) / 255 = 0.19608 and (255 - 206) / 255 = 0.19216, either side of 0.196.
+@pytest.mark.parametrize(
+    ("negate", "greys", "free"),
+    [
+        ("0", (254, 206, 205, 100, 0), [True, True, False, False, False]),
+        ("1", (254, 206, 49, 50, 0), [False, False, True, False, True]),
+        ("false", (254, 0), [True, False]),
+        ("true", (254, 0), [False, True]),
+    ],
+)
+def test_free_is_occupancy_below_the_threshold(
+    room: Room, negate: str, greys: tuple[int, ...], free: list[bool]
+) -> None:
+    assert free_bands(room(grey=blocks(*greys), negate=negate), len(greys)) == free
+
+
+def test_an_occupancy_equal_to_the_threshold_is_not_free(room: Room) -> None:
+    # (255 - 204) / 255 is 0.2 exactly.
+    assert free_bands(room(grey=blocks(255, 204, 205), free_thresh="0.2"), 3) == [True, False, True]
+
+
+def test_raw_images_hold_percentages_and_ignore_negate(room: Room) -> None:
+    for negate in "01":
+        path = room(grey=blocks(0, 19, 20, 100, 101, 255), mode="raw", negate=negate)
+        assert free_bands(path, 6) == [True, True, False, False, False, False]
+
+
+def test_scale_mode_needs_an_opaque_pixel(room: Room) -> None:
+    pixels = np.stack([blocks(254, 254, 254, 0), blocks(255, 254, 0, 255)], axis=-1)
+    scale = room(image=png_bytes(pixels), mode="scale")
+    assert free_bands(scale, 4) == [True, False, False, False]
+    # Trinary averages alpha in: (254 + 254) / 2 is free, (254 + 0) / 2 and (0 + 255) / 2 are not.
+    trinary = room(image=png_bytes(pixels), mode="trinary")
+    assert free_bands(trinary, 4) == [True, True, False, False]
+
+
+def test_colour_is_averaged(room: Room) -> None:
+    # Means 254, 206, 205 and 85: the limit lies between 206 and 205, as it does for grey.
+    channels = [(254, 255, 255, 255), (254, 160, 159, 0), (254, 203, 201, 0)]
+    pixels = np.stack([blocks(*channel) for channel in channels], axis=-1)
+    assert free_bands(room(image=png_bytes(pixels)), 4) == [True, True, False, False]
+
+
+@pytest.mark.parametrize("mode", ["P", "1"])
+def test_palette_and_black_and_white_images_are_read(room: Room, mode: str) -> None:
+    assert free_bands(room(image=png_bytes(blocks(255, 0, 255), mode)), 3) == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["pgm", "png"])
+def test_sixteen_bits_are_not_clipped(room: Room, kind: str) -> None:
+    # 0.196 of 65535 is 12845: 52691 is occupancy 0.19599. Clipped at 255 all but 0 would be white.
+    grey = blocks(65535, 52691, 52690, 300, 0, dtype=np.uint16)
+    image = pgm_bytes(grey, 65535) if kind == "pgm" else png_bytes(grey)
+    assert free_bands(room(image=image), 5) == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize("maxval", [1, 15, 100, 255, 1000, 65535])
+def test_grey_is_relative_to_the_largest_value(room: Room, maxval: int) -> None:
+    grey = blocks(maxval, 0, round(0.7 * maxval), dtype=np.uint16)
+    middle = round(0.7 * maxval) == maxval
+    assert free_bands(room(image=pgm_bytes(grey, maxval)), 3) == [True, False, middle]
+
+
+@pytest.mark.parametrize("maxval", [255, 65535])
+def test_a_text_pgm_with_comments_is_read(room: Room, maxval: int) -> None:
+    rows = "\n".join(" ".join(str(v * maxval) for v in row) for row in blocks(1, 0).tolist())
+    text = f"P2 # kind\n# resolution: 0.05 m\n60 20\n# another\n{maxval}\n{rows}\n"
+    assert free_bands(room(image=text.encode()), 2) == [True, False]
+
+
+def test_a_comment_in_a_binary_pgm_is_skipped(room: Room) -> None:
+    data = b"P5\n# CREATOR: map_generator 0.050 m/pix\n60 20\n255\n" + blocks(254, 0).tobytes()
+    assert free_bands(room(image=data), 2) == [True, False]
+
+
+def test_unknown_ground_that_reads_as_free_is_warned_about(room: Room) -> None:
+    path = room(grey=blocks(254, 254, 205), free_thresh="0.25")
+    with pytest.warns(UserWarning, match=r"room\.yaml: grey 205 of 255 .* fills 33% ") as caught:
+        loaded = load_map(path)
+    assert [str(warning.message) for warning in caught] == list(loaded.warnings)
+    # A third of the ground in a shade that no program writes for unknown is as suspicious ...
+    with pytest.warns(UserWarning, match="grey 200 of 255"):
+        load_map(room(grey=blocks(254, 254, 200), free_thresh="0.25"))
+
+
+@pytest.mark.parametrize(
+    ("greys", "free_thresh"),
+    [
+        ((254, 254, 205), "0.196"),  # unknown is not free: the usual file
+        ((205, 205, 0), "0.25"),  # the lightest there is
+        ((254, 240, 230), "0.25"),  # far from the threshold
+        ((254,) * 8 + (200,), "0.25"),  # a small area
+    ],
+)
+def test_ordinary_maps_are_not_warned_about(
+    room: Room, greys: tuple[int, ...], free_thresh: str
+) -> None:
+    # Warnings are errors here.
+    assert load_map(room(grey=blocks(*greys), free_thresh=free_thresh)).warnings == ()
+
+
+def test_an_image_in_a_folder_below_is_found(room: Room, tmp_path: Path) -> None:
+    path = room(image_name="x")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "room.pgm").rename(tmp_path / "images" / "grid.pgm")
+    path.write_text(path.read_text().replace("room.pgm", "images/grid.pgm"))
+    assert load_map(path).shape == (90, 120)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_a_saved_map_comes_back(tmp_path: Path, yaw: float) -> None:
+    rng = np.random.default_rng(0)
+    occupied = rng.random((37, 61)) < 0.1
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    occupied[1:8, 1:-1] = False
+    points = np.array([[0.1, 0.1], [1 / 3, 0.2], [2.7, 0.35]])
+    original = OccupancyMap(
+        name="saved: twice #1",
+        occupied=occupied,
+        resolution=0.1 / 2.1,
+        spawn_points=points,
+        evaluation_points=points[:2],
+        origin=(0.0 if yaw == 0 else 1 / 7, 0.0 if yaw == 0 else -3.0, yaw),
+        spawn_radius=1 / 7,
+        max_steps=123,
+    )
+    save_map(original, tmp_path / "saved: twice #1.yaml")
+    loaded = load_map(tmp_path / "saved: twice #1.yaml", robot_radius=0.0)
+    for field in ("name", "resolution", "origin", "spawn_radius", "max_steps"):
+        assert getattr(loaded, field) == getattr(original, field)
+    np.testing.assert_array_equal(loaded.occupied, occupied)
+    atol = 0.0 if yaw == 0 else 1e-12
+    np.testing.assert_allclose(loaded.spawn_points, points, rtol=0, atol=atol)
+    np.testing.assert_allclose(loaded.evaluation_points, points[:2], rtol=0, atol=atol)
+
+
+def test_saving_where_one_cannot_write_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"absent.*m\.yaml: cannot be written"):
+        save_map(load_map("maze"), tmp_path / "absent" / "m.yaml")
+    with pytest.raises(ValueError, match=r"expected a path ending in \.yaml"):
+        save_map(load_map("maze"), tmp_path / "m.png")
