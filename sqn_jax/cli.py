@@ -18,7 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from sqn_jax.config import PRESETS, TrainConfig
+from sqn_jax.config import TrainConfig
+from sqn_jax.presets import PRESETS
 
 USAGE = """usage: sqn COMMAND [OPTIONS]
 
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(f"unknown command {words[0]!r}, expected one of {', '.join(_COMMANDS)}")
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _show_warning  # type: ignore[assignment]
             return command(words[1:])
     except ValueError as error:
         return _refuse(str(error))

@@ -1,12 +1,12 @@
-"""Every setting of a run, as frozen dataclasses that check themselves, and the three presets.
+"""Every setting of a run, as frozen dataclasses that check themselves.
 
 A config is static: it is hashable, decides shapes and branches, and is passed to jitted functions
 as a static argument. Numbers that one might sweep inside one program (speeds, noise, reward
 weights) are copied from `EnvConfig` into the traced `EnvParams` when an environment is made.
 
-The `paper` preset follows "Skill Q-Network: Learning Adaptive Skill Ensemble for Mapless
-Navigation in Unknown Environments", section IV-D; where the paper is silent, docs/ARCHITECTURE.md
-states the value chosen and why.
+The defaults follow "Skill Q-Network: Learning Adaptive Skill Ensemble for Mapless Navigation in
+Unknown Environments", section IV-D; where the paper is silent, docs/ARCHITECTURE.md states the
+value chosen and why. The other presets stand in `presets.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import Any, Literal
 
 Algorithm = Literal["sqn", "r2d2", "dqn"]
 Method = Literal["r2d2", "pqn"]
-PresetName = Literal["quick", "paper", "smoke"]
 
 
 def _require(condition: bool, name: str, value: object, expected: str) -> None:
@@ -160,7 +159,7 @@ class LearnerConfig:
     """The update rule. Fields used by one method only say so."""
 
     batch_size: int = 64
-    """Whole episodes an update."""
+    """Robots an update: whole episodes for r2d2, windows of them for pqn."""
     learning_rate: float = 3e-4
     """Adam's step size at the start."""
     learning_rate_schedule: Literal["constant", "linear"] = "constant"
@@ -183,15 +182,20 @@ class LearnerConfig:
     """r2d2: Polyak coefficient tau of the target network."""
     trace_decay: float = 0.8
     """pqn: lambda of the Q(lambda) returns."""
+    window_length: int = 0
+    """pqn: steps driven between updates, a divisor of the episode; 0 is the whole episode."""
+    num_passes: int = 1
+    """pqn: how often each step is learned from."""
 
     def __post_init__(self) -> None:
         for name in ("learning_rate", "adam_epsilon", "max_grad_norm"):
             _require_positive(self, "learner", name)
-        for name in ("batch_size", "n_step"):
+        for name in ("batch_size", "n_step", "num_passes"):
             value = getattr(self, name)
             _require(value >= 1, f"learner.{name}", value, "at least 1")
-        value = self.burn_in_length
-        _require(value >= 0, "learner.burn_in_length", value, "0 or a positive number")
+        for name in ("burn_in_length", "window_length"):
+            value = getattr(self, name)
+            _require(value >= 0, f"learner.{name}", value, "0 or a positive number")
         for name in ("discount", "trace_decay"):
             value = getattr(self, name)
             _require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
@@ -253,7 +257,7 @@ class TrainConfig:
     num_envs: int = 50
     """Robots that drive side by side; each round is one whole episode of all of them."""
     updates_per_round: int = 50
-    """Updates after each round. pqn visits every episode of a round equally often."""
+    """r2d2: updates after each round."""
     rounds_per_chunk: int = 1
     """Rounds in one call of the compiled program; the host looks in between chunks."""
     checkpoint_minutes: float = 10.0
@@ -288,13 +292,6 @@ class TrainConfig:
             )
         else:
             _require(
-                self.updates_per_round * self.learner.batch_size % self.num_envs == 0,
-                "updates_per_round",
-                self.updates_per_round,
-                "updates_per_round x learner.batch_size to be a multiple of num_envs "
-                f"({self.num_envs}), so that pqn sees every episode equally often",
-            )
-            _require(
                 self.num_envs % self.learner.batch_size == 0,
                 "learner.batch_size",
                 self.learner.batch_size,
@@ -321,47 +318,9 @@ def _require_positive(config: object, group: str, name: str) -> None:
 
 def _require_not_negative(config: object, group: str, name: str) -> None:
     value = getattr(config, name)
-    _require(math.isfinite(value) and value >= 0, f"{group}.{name}", value, "0 or a positive number")
-
-
-def _quick() -> TrainConfig:
-    """Recurrent PQN within the budget of two CPU cores; docs/RESULTS.md has the measurements."""
-    return TrainConfig(
-        method="pqn",
-        total_episodes=56_320,
-        num_envs=256,
-        updates_per_round=16,
-        rounds_per_chunk=2,
-        network=NetworkConfig(layer_norm=True),
-        learner=LearnerConfig(
-            batch_size=16,
-            learning_rate=1e-3,
-            learning_rate_schedule="linear",
-            discount=0.99,
-        ),
-        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+    _require(
+        math.isfinite(value) and value >= 0, f"{group}.{name}", value, "0 or a positive number"
     )
-
-
-def _smoke() -> TrainConfig:
-    """Every part of a run in less than a minute, without learning anything useful."""
-    return TrainConfig(
-        method="pqn",
-        total_episodes=64,
-        num_envs=16,
-        updates_per_round=2,
-        rounds_per_chunk=2,
-        env=EnvConfig(max_steps=60),
-        network=NetworkConfig(layer_norm=True),
-        replay=ReplayConfig(capacity=64, min_episodes=16),
-        learner=LearnerConfig(batch_size=8, learning_rate=1e-3, discount=0.99),
-        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
-        eval=EvalConfig(episodes=8),
-    )
-
-
-PRESETS: dict[str, TrainConfig] = {"quick": _quick(), "paper": TrainConfig(), "smoke": _smoke()}
-"""`quick` is the default, `paper` follows the paper to the letter, `smoke` is for tests."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:

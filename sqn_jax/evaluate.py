@@ -13,7 +13,7 @@ from jax import Array
 from sqn_jax.agent.networks import Params, make_network
 from sqn_jax.config import Algorithm, NetworkConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.rollout import EpisodeSummary, Trace, reset_all, summarize, unroll
+from sqn_jax.rollout import EpisodeSummary, Trace, start_fleet, summarize, unroll
 from sqn_jax.statistics import bootstrap_interval, wilson_interval
 
 
@@ -45,10 +45,17 @@ def run_episodes(
     """
     start_key, unroll_key = jax.random.split(key)
     network = make_network(algo, network_config, NUM_ACTIONS)
-    start = reset_all(start_key, num_episodes, env_params)
-    epsilon = jnp.zeros(num_episodes)
-    episodes, trace = unroll(unroll_key, network, params, start, epsilon, env_params)
-    return summarize(episodes, trace, env_params.goal_radius), trace
+    fleet = start_fleet(start_key, num_episodes, network, env_params)
+    _, _, trace = unroll(
+        unroll_key,
+        network,
+        params,
+        fleet,
+        jnp.zeros(num_episodes),
+        env_params,
+        num_steps=env_params.max_steps,
+    )
+    return summarize(trace, env_params.goal_radius), trace
 
 
 def select_seed(params: Params, index: int) -> Params:

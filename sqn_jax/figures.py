@@ -32,8 +32,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 DPI = 160
 WIDTH_IN = 9.0
-MAX_PATHS = 8
-"""Paths drawn in one panel; more would hide each other."""
+MAX_PATHS = 8  # in one panel; more would hide each other
 
 # Okabe and Ito's colours, told apart under every common colour blindness; no yellow on white.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -251,6 +250,8 @@ def trajectories(
     if max(panel.total for panel in panels) > MAX_PATHS:
         shown += f", at most {MAX_PATHS} paths a goal drawn"
     figure.suptitle(f"{title}\n{shown}", fontsize=12)
+    # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
+    figure.draw_without_rendering()
     return figure
 
 
@@ -308,7 +309,7 @@ def _evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 def _panel_grid(occupancy_map: OccupancyMap, count: int) -> tuple[Figure, list[Axes]]:
     """A figure with one panel a goal, its height fitted to the shape of the map."""
-    columns = min(count, 2 if count <= 4 else 3)
+    columns = min(count, 2)  # three would squeeze the titles into each other
     lines = math.ceil(count / columns)
     width, height = occupancy_map.size_m
     panel_width = (WIDTH_IN - 2.2) / columns
@@ -372,8 +373,7 @@ def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> Non
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
         for label, marker, size, face, edge in marks
     ]
-    handles.append(Patch(fc=_OBSTACLE, label="obstacle"))
-    handles.append(Patch(fc=_UNREACHABLE, label="no room or no path"))
+    handles += [Patch(fc=_OBSTACLE, label="obstacle"), Patch(fc=_UNREACHABLE, label="unreachable")]
     look: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
     figure.legend(handles=handles, loc="outside lower center", fontsize=9, **look)
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.exploration import epsilon_greedy
 from sqn_jax.agent.experience import Episodes
+from sqn_jax.agent.exploration import epsilon_greedy
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
@@ -24,6 +26,8 @@ class Trace:
     """[T + 1, N, 3] x m, y m, heading rad; the first is the start."""
     goals: Array
     """[N, 2] m."""
+    rewards: Array
+    """[T, N]."""
     goal_distances: Array
     """[T, N] line-of-sight distance after each step, m."""
     collisions: Array
@@ -36,74 +40,103 @@ class Trace:
     """[T, N, K, A] action values of each skill, as the network puts them out."""
 
 
-def reset_all(key: Array, num_envs: int, env_params: EnvParams) -> tuple[Observation, EnvState]:
+@struct.dataclass
+class Fleet:
+    """N robots on their way: what an unroll starts from and leaves behind."""
+
+    obs: Observation
+    """[N, ...] what they see now."""
+    state: EnvState
+    """[N, ...] where they are."""
+    carry: Array
+    """[N, H] recurrent state of their network."""
+
+
+def start_fleet(key: Array, num_envs: int, network: QNetwork, env_params: EnvParams) -> Fleet:
     """Start N independent episodes; the key is consumed."""
     keys = jax.random.split(key, num_envs)
-    return jax.vmap(navigation.reset, in_axes=(0, None))(keys, env_params)
+    obs, state = jax.vmap(navigation.reset, in_axes=(0, None))(keys, env_params)
+    return Fleet(obs=obs, state=state, carry=initial_carry(network.config, num_envs))
 
 
 def unroll(
     key: Array,
     network: QNetwork,
     params: Params,
-    start: tuple[Observation, EnvState],
+    fleet: Fleet,
     epsilon: Array,
     env_params: EnvParams,
-) -> tuple[Episodes, Trace]:
-    """Drive N robots from their starts for a whole episode, without reset.
+    *,
+    num_steps: int,
+) -> tuple[Fleet, Episodes, Trace]:
+    """Drive N robots for T steps, without reset.
 
     Args:
         key: consumed.
         network: the agent.
         params: its parameters.
-        start: first observation and state of each robot, [N, ...].
+        fleet: the robots.
         epsilon: [N] probabilities of a random action; 0 is greedy.
         env_params: the world.
+        num_steps: T.
 
     Returns:
-        The episodes for the learner, and the trace for statistics and pictures.
+        The robots afterwards, the steps for the learner, and the trace for statistics and
+        pictures.
     """
-    obs, state = start
-    num_envs = state.step.shape[0]
-    keys = jax.random.split(key, env_params.max_steps)
     act_and_step = partial(
         _act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
     )
-    first = (obs, state, initial_carry(network.config, num_envs))
-    (last_obs, last_state, _), (observations, poses, actions, results, outputs) = jax.lax.scan(
-        act_and_step, first, keys
-    )
+    keys = jax.random.split(key, num_steps)
+    last, (observations, poses, actions, results, outputs) = jax.lax.scan(act_and_step, fleet, keys)
     reward, terminated, info = results
     episodes = Episodes(
-        obs=jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), observations, last_obs),
+        obs=jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), observations, last.obs),
         actions=actions,
         rewards=reward,
         terminated=terminated,
+        carry=fleet.carry,
     )
     trace = Trace(
-        poses=jnp.concatenate([poses, last_state.pose[None]]),
-        goals=state.goal,
+        poses=jnp.concatenate([poses, last.state.pose[None]]),
+        goals=fleet.state.goal,
+        rewards=reward,
         goal_distances=info["goal_distance"],
         collisions=info["collision"],
         covered_areas=info["covered_area"],
         skill_weights=outputs.skill_weights,
         skill_q_values=outputs.skill_q_values,
     )
-    return episodes, trace
+    return last, episodes, trace
 
 
-def _act_and_step(carry, key, *, network, params, epsilon, env_params):  # type: ignore[no-untyped-def]
+def _act_and_step(
+    fleet: Fleet,
+    key: Array,
+    *,
+    network: QNetwork,
+    params: Params,
+    epsilon: Array,
+    env_params: EnvParams,
+) -> tuple[Fleet, tuple[Any, ...]]:
     """One step of all robots: Q-values, action, simulator."""
-    obs, state, hidden = carry
     action_key, step_key = jax.random.split(key)
-    hidden, output = network.apply(params, jax.tree.map(lambda x: x[None], obs), hidden)
+    carry, output = network.apply(params, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
     output = jax.tree.map(lambda x: x[0], output)
     action = epsilon_greedy(action_key, output.q_values, epsilon)
     step_keys = jax.random.split(step_key, action.shape[0])
     step = jax.vmap(navigation.step, in_axes=(0, 0, 0, None))
-    new_obs, new_state, reward, terminated, _, info = step(step_keys, state, action, env_params)
-    emitted = (obs, state.pose, action, (reward, terminated, info), output)
-    return (new_obs, new_state, hidden), emitted
+    obs, state, reward, terminated, _, info = step(step_keys, fleet.state, action, env_params)
+    emitted = (fleet.obs, fleet.state.pose, action, (reward, terminated, info), output)
+    return Fleet(obs=obs, state=state, carry=carry), emitted
+
+
+def join_windows(traces: Trace) -> Trace:
+    """One trace of an episode out of its windows, stacked [W, T / W, N, ...]."""
+    moves = dataclasses.replace(traces, poses=traces.poses[:, 1:])
+    joined = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
+    poses = jnp.concatenate([traces.poses[0, :1], joined.poses])
+    return dataclasses.replace(joined, poses=poses, goals=traces.goals[0])
 
 
 @struct.dataclass
@@ -124,7 +157,7 @@ class EpisodeSummary:
     """m driven up to the first entry, or in the whole episode for a failure."""
 
 
-def summarize(episodes: Episodes, trace: Trace, goal_radius: Array) -> EpisodeSummary:
+def summarize(trace: Trace, goal_radius: Array) -> EpisodeSummary:
     """Reduce whole episodes to one number each.
 
     Success counts from the first step on; a robot that starts within the radius has it at step 1
@@ -140,7 +173,7 @@ def summarize(episodes: Episodes, trace: Trace, goal_radius: Array) -> EpisodeSu
     return EpisodeSummary(
         success=success,
         time_steps=time_steps,
-        mean_reward=episodes.rewards.mean(axis=0),
+        mean_reward=trace.rewards.mean(axis=0),
         collisions=trace.collisions.sum(axis=0, dtype=jnp.int32),
         covered_area=trace.covered_areas.sum(axis=0),
         path_length=jnp.where(counted, driven, 0.0).sum(axis=0),

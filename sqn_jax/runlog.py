@@ -1,11 +1,11 @@
 """A run folder: what a training run leaves on disk, and how it is read back.
 
-    config.json      every setting
-    metrics.jsonl    one object a chunk
-    checkpoints/     the state of the run
-    evaluation.json  statistics of the final evaluation; evaluation.jsonl has every episode
-    figures/*.png    learning curve, trajectories
-    summary.json     what it came to
+config.json      every setting
+metrics.jsonl    one object a chunk
+checkpoints/     the state of the run
+evaluation.json  statistics of the final evaluation; evaluation.jsonl has every episode
+figures/*.png    learning curve, trajectories
+summary.json     what it came to
 """
 
 from __future__ import annotations

@@ -26,13 +26,13 @@ from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder
-from sqn_jax.train import ChunkReport, RunnerState, memory_bytes, run, start_run
+from sqn_jax.train import ChunkReport, RunnerState, compile_chunk, memory_bytes, run, start_run
 
 TASKS = {"evaluation points": "evaluation", "random pairs": "training"}
 """What the final evaluation is done on, and the spawn mode that draws it."""
 
 
-class Stopped(Exception):  # noqa: N818
+class Stopped(Exception):
     """The run was stopped by a signal, after saving; carries the exit code."""
 
     def __init__(self, signal_number: int) -> None:
@@ -74,7 +74,7 @@ def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path) -> None
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
         f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
         f"run folder {run_dir}, device {device.platform} ({device.device_kind}), "
-        f"episodes in memory {memory_bytes(config, env_params) / 1e6:,.0f} MB"
+        f"episodes in memory {memory_bytes(config, env_params) / 1e6:,.1f} MB"
     )
 
 
@@ -106,18 +106,14 @@ def _train(
 ) -> tuple[RunnerState, dict[str, float]]:
     """Drive the training to its end; returns the final state and how long it took."""
     timing = {"compile_seconds": 0.0, "train_seconds": seconds_before, "env_steps": 0.0}
-    last_saved, chunk = time.monotonic(), 0
     episodes_a_chunk = config.rounds_per_chunk * config.num_envs
     print("compiling ...", end="", flush=True)
-    with _signals() as received, _bar(config) as bar:
-        for runner, report in run(runner, env_params, config):  # noqa: B020
-            if chunk == 0:
-                tqdm.write(f"\rcompiled in {report.compile_seconds:.1f} s", file=sys.stdout)
-                bar.reset(total=config.num_chunks * episodes_a_chunk)
-                bar.update((report.chunk - 1) * episodes_a_chunk)
-                bar.initial = bar.n
-            chunk = report.chunk
-            timing["compile_seconds"] += report.compile_seconds
+    program, timing["compile_seconds"] = compile_chunk(runner, env_params, config)
+    print(f"\rcompiled in {timing['compile_seconds']:.1f} s")
+    last_saved = time.monotonic()
+    rounds_done = int(np.max(np.asarray(runner.round)))
+    with _signals() as received, _bar(config, rounds_done * config.num_envs) as bar:
+        for runner, report in run(runner, env_params, config, program):  # noqa: B020
             timing["train_seconds"] += report.seconds
             timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
             row = _row(report, timing["train_seconds"], env_params, config)
@@ -125,7 +121,7 @@ def _train(
             bar.set_postfix_str(_postfix(row), refresh=False)
             bar.update(episodes_a_chunk)
             if received or time.monotonic() - last_saved > 60 * config.checkpoint_minutes:
-                checkpoints.save(chunk, runner)
+                checkpoints.save(report.chunk, runner)
                 last_saved = time.monotonic()
             if received:
                 raise Stopped(received[0])
@@ -134,15 +130,15 @@ def _train(
     return runner, timing
 
 
-def _bar(config: TrainConfig) -> tqdm[Any]:
+def _bar(config: TrainConfig, episodes_done: int) -> tqdm[Any]:
     return tqdm(
-        unit=" episodes",
+        total=config.num_rounds * config.num_envs,
+        initial=episodes_done,
         mininterval=0.5 if sys.stderr.isatty() else 20,
         smoothing=0.1,
         dynamic_ncols=True,
         bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
         "[{elapsed}, {remaining} left{postfix}]",
-        disable=None if config.total_episodes == 0 else False,
     )
 
 
@@ -202,7 +198,8 @@ def _evaluate(
     if config.num_seeds > 1:
         seeds = [evaluate.select_seed(params, index) for index in range(config.num_seeds)]
     results: Results = {}
-    entries, records = [], []
+    entries: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     for number, (tasks, spawn) in enumerate(TASKS.items()):
         env_params = make_env(occupancy_map, config.env, spawn=spawn)  # type: ignore[arg-type]
         key = jax.random.fold_in(jax.random.key(config.eval.seed), number)

@@ -7,7 +7,7 @@ in between. Files, bars and pictures stand outside, in whoever consumes the gene
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,9 +24,10 @@ from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, init_learner, make_optimizer
 from sqn_jax.agent.networks import QNetwork, make_network
+from sqn_jax.agent.replay import ReplayState
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.rollout import reset_all, summarize, unroll
+from sqn_jax.rollout import Fleet, Trace, join_windows, start_fleet, summarize, unroll
 
 
 @struct.dataclass
@@ -48,23 +49,47 @@ def network_of(config: TrainConfig) -> QNetwork:
     return make_network(config.algo, config.network, NUM_ACTIONS)
 
 
-def optimizer_of(config: TrainConfig) -> optax.GradientTransformation:
-    """The optimiser a config asks for."""
-    return make_optimizer(config.learner, config.num_rounds * config.updates_per_round)
+def num_windows(config: TrainConfig, env_params: EnvParams) -> int:
+    """Windows an episode is driven in: one for `r2d2`.
+
+    Raises:
+        ValueError: the window does not divide the episode.
+    """
+    window = config.learner.window_length if config.method == "pqn" else 0
+    if window and env_params.max_steps % window:
+        raise ValueError(
+            f"learner.window_length is {window}, expected a divisor of the episode's "
+            f"{env_params.max_steps} steps"
+        )
+    return env_params.max_steps // window if window else 1
+
+
+def updates_a_round(config: TrainConfig, env_params: EnvParams) -> int:
+    """Updates of the network in one round."""
+    if config.method == "r2d2":
+        return config.updates_per_round
+    batches = config.num_envs // config.learner.batch_size
+    return num_windows(config, env_params) * batches * config.learner.num_passes
+
+
+def optimizer_of(config: TrainConfig, env_params: EnvParams) -> optax.GradientTransformation:
+    """The optimiser a config asks for; its schedule spans the run."""
+    total = config.num_rounds * updates_a_round(config, env_params)
+    return make_optimizer(config.learner, total)
 
 
 def episode_shapes(config: TrainConfig, env_params: EnvParams) -> Episodes:
-    """Shapes and dtypes of a round of episodes, without computing anything."""
+    """Shapes and dtypes of what one unroll hands to the learner, without computing anything."""
     network = network_of(config)
+    num_steps = env_params.max_steps // num_windows(config, env_params)
 
-    def one_round(key: Array) -> Episodes:
-        start = reset_all(key, config.num_envs, env_params)
-        obs = jax.tree.map(lambda x: x[None], start[0])
-        learner = init_learner(key, network, optimizer_of(config), obs, use_target=False)
+    def one_unroll(key: Array) -> Episodes:
+        fleet = start_fleet(key, config.num_envs, network, env_params)
+        params = network.init(key, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
         epsilon = jnp.zeros(config.num_envs)
-        return unroll(key, network, learner.params, start, epsilon, env_params)[0]
+        return unroll(key, network, params, fleet, epsilon, env_params, num_steps=num_steps)[1]
 
-    return jax.eval_shape(one_round, jax.random.key(0))
+    return jax.eval_shape(one_unroll, jax.random.key(0))
 
 
 def memory_bytes(config: TrainConfig, env_params: EnvParams) -> int:
@@ -79,15 +104,16 @@ def memory_bytes(config: TrainConfig, env_params: EnvParams) -> int:
 def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> RunnerState:
     """The state of one run before its first round; the key is consumed."""
     learner_key, obs_key, run_key = jax.random.split(key, 3)
-    obs, _ = reset_all(obs_key, config.num_envs, env_params)
+    network = network_of(config)
+    fleet = start_fleet(obs_key, 1, network, env_params)
     learner = init_learner(
         learner_key,
-        network_of(config),
-        optimizer_of(config),
-        jax.tree.map(lambda x: x[None], obs),
+        network,
+        optimizer_of(config, env_params),
+        jax.tree.map(lambda x: x[None], fleet.obs),
         use_target=config.method == "r2d2",
     )
-    memory = None
+    memory: ReplayState | None = None
     if config.method == "r2d2":
         item = r2d2.packed_item(episode_shapes(config, env_params))
         memory = replay.init(item, config.replay.capacity)
@@ -97,32 +123,55 @@ def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> Runne
 def train_round(
     runner: RunnerState, _: None, *, env_params: EnvParams, config: TrainConfig
 ) -> tuple[RunnerState, dict[str, Array]]:
-    """One whole episode of all robots, then the updates; returns scalars to log."""
-    key, reset_key, unroll_key, learn_key = jax.random.split(runner.key, 4)
-    network = network_of(config)
+    """One whole episode of all robots, with the updates; returns scalars to log."""
+    key, fleet_key, window_key = jax.random.split(runner.key, 3)
+    windows = num_windows(config, env_params)
     progress = runner.round / config.num_rounds
     epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
-    start = reset_all(reset_key, config.num_envs, env_params)
-    episodes, trace = unroll(
-        unroll_key, network, runner.learner.params, start, epsilon, env_params
-    )
-    summary = summarize(episodes, trace, env_params.goal_radius)
-    learn = r2d2.learn if config.method == "r2d2" else pqn.learn
-    learner, memory, learning = learn(
-        learn_key, runner.learner, runner.memory, episodes, network, optimizer_of(config), config
-    )
+    fleet = start_fleet(fleet_key, config.num_envs, network_of(config), env_params)
+    body = partial(_drive_and_learn, epsilon=epsilon, env_params=env_params, config=config)
+    first = (runner.learner, runner.memory, fleet)
+    keys = jax.random.split(window_key, windows)
+    (learner, memory, _fleet), (traces, learning) = jax.lax.scan(body, first, keys)
+    trace = join_windows(traces)
+    summary = summarize(trace, env_params.goal_radius)
     metrics = {
         "mean_reward": summary.mean_reward.mean(),
         "success": summary.success.mean(),
         "time_steps": summary.time_steps.mean(),
         "collisions": summary.collisions.mean(),
         "covered_area": summary.covered_area.mean(),
+        "updates": learner.num_updates,
         "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
         "epsilon": epsilon_schedule(progress, config.exploration),
-        **learning,
+        **jax.tree.map(jnp.mean, learning),
     }
     new_runner = RunnerState(learner=learner, memory=memory, key=key, round=runner.round + 1)
     return new_runner, metrics
+
+
+def _drive_and_learn(
+    carry: tuple[LearnerState, Any, Fleet],
+    key: Array,
+    *,
+    epsilon: Array,
+    env_params: EnvParams,
+    config: TrainConfig,
+) -> tuple[tuple[LearnerState, Any, Fleet], tuple[Trace, dict[str, Array]]]:
+    """One window: drive it, learn from it."""
+    learner, memory, fleet = carry
+    unroll_key, learn_key = jax.random.split(key)
+    network = network_of(config)
+    num_steps = env_params.max_steps // num_windows(config, env_params)
+    fleet, episodes, trace = unroll(
+        unroll_key, network, learner.params, fleet, epsilon, env_params, num_steps=num_steps
+    )
+    learn = r2d2.learn if config.method == "r2d2" else pqn.learn
+    optimizer = optimizer_of(config, env_params)
+    learner, memory, metrics = learn(
+        learn_key, learner, memory, episodes, network, optimizer, config
+    )
+    return (learner, memory, fleet), (trace, metrics)
 
 
 def train_chunk(
@@ -169,33 +218,50 @@ class ChunkReport:
     """Chunks done, from 1."""
     metrics: dict[str, Any]
     """Means over the chunk's rounds; a list with one number a seed where there are several."""
-    compile_seconds: float
-    """Time spent compiling before the first chunk of this process, else 0."""
     seconds: float
     """Time the chunk ran."""
 
 
-def run(
+ChunkProgram = Callable[[RunnerState, EnvParams], tuple[RunnerState, dict[str, Array]]]
+"""A compiled `train_chunk`."""
+
+
+def compile_chunk(
     runner: RunnerState, env_params: EnvParams, config: TrainConfig
+) -> tuple[ChunkProgram, float]:
+    """Compile `train_chunk` for states like `runner`; returns it and the seconds it took."""
+    started = time.perf_counter()
+    program = compiled_train_chunk.lower(runner, env_params, config).compile()
+    return program, time.perf_counter() - started
+
+
+def run(
+    runner: RunnerState,
+    env_params: EnvParams,
+    config: TrainConfig,
+    program: ChunkProgram | None = None,
 ) -> Iterator[tuple[RunnerState, ChunkReport]]:
     """Train chunk by chunk from any state to the end, yielding after each.
 
     The yielded state is donated to the next chunk: use it before asking for the next one.
+    `program` comes from `compile_chunk`; without one the first chunk waits for it.
     """
-    started = time.perf_counter()
-    program = compiled_train_chunk.lower(runner, env_params, config).compile()
-    compile_seconds = time.perf_counter() - started
+    if program is None:
+        program, _ = compile_chunk(runner, env_params, config)
     rounds_done = int(np.max(np.asarray(runner.round)))
     for chunk in range(rounds_done // config.rounds_per_chunk + 1, config.num_chunks + 1):
         started = time.perf_counter()
         runner, metrics = program(runner, env_params)
         host_metrics = jax.device_get(metrics)
         seconds = time.perf_counter() - started
-        yield runner, ChunkReport(chunk, _average(host_metrics, config), compile_seconds, seconds)
-        compile_seconds = 0.0
+        yield runner, ChunkReport(chunk, _average(host_metrics, config), seconds)
 
 
 def _average(metrics: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
-    """Mean over the rounds of a chunk, as plain numbers (lists over seeds, lists over skills)."""
+    """Mean over the rounds of a chunk, as plain numbers (lists over seeds, lists over skills).
+
+    Updates are a count: their last value. Before learning has begun there is no loss: NaN.
+    """
     axis = 0 if config.num_seeds == 1 else 1
-    return {name: np.mean(value, axis=axis).tolist() for name, value in metrics.items()}
+    means = {name: np.mean(value, axis=axis).tolist() for name, value in metrics.items()}
+    return means | {"updates": int(np.max(metrics["updates"]))}

@@ -33,16 +33,18 @@ RUN_LAYER = {
     "statistics",
     "train",
 }
-DEVICE_LAYER = {"config", "env", "agent", "rollout"}
+DEVICE_LAYER = {"config", "presets", "env", "agent", "rollout"}
 ARROWS: dict[str, set[str]] = {
     "config": set(),
+    "presets": {"config"},
     "maps": set(),
     "env": {"config"},
     "agent": {"config"},
     "rollout": {"config", "env", "agent"},
     **{room: RUN_LAYER | DEVICE_LAYER | {"maps"} for room in RUN_LAYER},
     "sqn_jax": RUN_LAYER | DEVICE_LAYER | {"maps"},
-    "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
+    "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
+    "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
     "__main__": {"cli"},
     "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
     "notebooks": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},

@@ -12,8 +12,8 @@ from jax import Array
 class Episodes:
     """T steps of N robots, time-major; every array of `obs` has one entry more, the last one seen.
 
-    An episode is cut by the time limit after T steps, which is no end: `terminated` alone stops
-    the bootstrap.
+    A whole episode, or a window of one. Either is cut after T steps, which is no end: `terminated`
+    alone stops the bootstrap.
     """
 
     obs: Any
@@ -24,3 +24,5 @@ class Episodes:
     """[T, N] float32."""
     terminated: Array
     """[T, N] bool: the episode truly ended with this step."""
+    carry: Array
+    """[N, H] the network's recurrent state before the first step; zero at an episode's start."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -72,7 +73,8 @@ def gradient_step(
     """
     (loss, output), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-    new_state = state.replace(
+    new_state = dataclasses.replace(
+        state,
         params=optax.apply_updates(state.params, updates),
         opt_state=opt_state,
         num_updates=state.num_updates + 1,
@@ -90,4 +92,4 @@ def gradient_step(
 def update_target(state: LearnerState, rate: float) -> LearnerState:
     """Polyak averaging: target <- (1 - rate) target + rate online."""
     target = optax.incremental_update(state.params, state.target_params, rate)
-    return state.replace(target_params=target)
+    return dataclasses.replace(state, target_params=target)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.experience import Episodes
-from sqn_jax.agent.networks import Params, QNetwork, QOutput, initial_carry
+from sqn_jax.agent.networks import Params, QNetwork, QOutput
 from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
 from sqn_jax.config import LearnerConfig
 
@@ -56,8 +56,8 @@ def r2d2_loss(
         The loss and its by-products.
     """
     burn_in = config.burn_in_length
-    online = _values_after_burn_in(network, params, episodes.obs, burn_in)
-    target = _values_after_burn_in(network, target_params, episodes.obs, burn_in)
+    online = _values_after_burn_in(network, params, episodes, burn_in)
+    target = _values_after_burn_in(network, target_params, episodes, burn_in)
     chooser = online if config.double_q else target
     best_action = jnp.argmax(chooser.q_values, axis=-1)
     bootstrap = jax.lax.stop_gradient(_pick(target.q_values, best_action))
@@ -73,11 +73,10 @@ def pqn_loss(
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
 
-    The episodes are fresh and whole, so the recurrent state starts at zero as it did when they
-    were driven; there is no burn-in, no replay and no target network. Arguments as for
-    `r2d2_loss`.
+    The steps are fresh, so the recurrent state they were driven with serves as the first one;
+    there is no burn-in, no replay and no target network. Arguments as for `r2d2_loss`.
     """
-    online = _values_after_burn_in(network, params, episodes.obs, 0)
+    online = _values_after_burn_in(network, params, episodes, 0)
     bootstrap = jax.lax.stop_gradient(online.q_values.max(axis=-1))
     learned = (episodes.actions, episodes.rewards, episodes.terminated)
     multi_step = partial(lambda_targets, trace_decay=config.trace_decay)
@@ -86,17 +85,16 @@ def pqn_loss(
 
 
 def _values_after_burn_in(
-    network: QNetwork, params: Params, obs: Any, burn_in_length: int
+    network: QNetwork, params: Params, episodes: Episodes, burn_in_length: int
 ) -> QOutput:
     """Outputs for the observations from `burn_in_length` on, warmed up on those before."""
-    batch_size = jax.tree.leaves(obs)[0].shape[1]
-    carry = initial_carry(network.config, batch_size)
+    carry = episodes.carry
     if burn_in_length > 0:
-        warm_up = jax.tree.map(lambda x: x[:burn_in_length], obs)
+        warm_up = jax.tree.map(lambda x: x[:burn_in_length], episodes.obs)
         carry, _ = network.apply(params, warm_up, carry)
         carry = jax.lax.stop_gradient(carry)
-    _, output = network.apply(params, jax.tree.map(lambda x: x[burn_in_length:], obs), carry)
-    return output
+    learned = jax.tree.map(lambda x: x[burn_in_length:], episodes.obs)
+    return cast(QOutput, network.apply(params, learned, carry)[1])
 
 
 def _squared_error(
@@ -138,6 +136,6 @@ def skill_distance(skill_q_values: Array) -> Array:
 
 
 def _pick(q_values: Array, actions: Array) -> Array:
-    """Values [T, B] of actions [T, B] out of [T, B, A]; a product, since gathers have slow adjoints."""
+    """Values [T, B] of actions [T, B] out of [T, B, A]; the adjoint of a gather would be slow."""
     chosen = jax.nn.one_hot(actions, q_values.shape[-1], dtype=q_values.dtype)
     return (q_values * chosen).sum(axis=-1)

@@ -1,7 +1,9 @@
-"""Recurrent PQN: many robots, fresh whole episodes, Q(lambda) targets; no replay, no target net.
+"""Recurrent PQN: many robots, fresh steps, Q(lambda) targets; no replay, no target network.
 
-Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024), with whole episodes
-as sequences. Layer normalisation takes the place of the target network.
+Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024). The robots drive a
+window of an episode, the network is updated on it, and they drive on with the new network; the
+recurrent state is handed from window to window. Layer normalisation takes the place of the target
+network.
 """
 
 from __future__ import annotations
@@ -30,30 +32,38 @@ def learn(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
 ) -> tuple[LearnerState, None, dict[str, Array]]:
-    """Go through a round of episodes in minibatches, each episode equally often.
+    """Go through a window of all robots in minibatches, each robot equally often.
 
-    Robot n is in minibatch n mod M, so that each minibatch spans the exploration ladder. Episodes
-    of a round are independent of each other: there is nothing to shuffle within a pass, and the
-    key is not needed.
+    Robot n is in minibatch n mod M, so that each minibatch spans the exploration ladder. Robots
+    are independent of each other: there is nothing to shuffle, and the key is not needed.
     """
     del key
     num_batches = config.num_envs // config.learner.batch_size
-    num_passes = config.updates_per_round // num_batches
-    batches = jax.tree.map(partial(_split_robots, num_batches=num_batches), episodes)
+    batches = split_robots(episodes, num_batches)
     update = partial(_update, network=network, optimizer=optimizer, config=config)
 
     def one_pass(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, Array]]:
         return jax.lax.scan(update, state, batches)
 
-    state, metrics = jax.lax.scan(one_pass, state, None, length=num_passes)
+    state, metrics = jax.lax.scan(one_pass, state, None, length=config.learner.num_passes)
     return state, memory, jax.tree.map(jnp.mean, metrics)
 
 
-def _split_robots(array: Array, num_batches: int) -> Array:
-    """[T, N, ...] to [M, T, N / M, ...]."""
-    length, robots, *rest = array.shape
-    grouped = array.reshape(length, robots // num_batches, num_batches, *rest)
-    return jnp.moveaxis(grouped, 2, 0)
+def split_robots(episodes: Episodes, num_batches: int) -> Episodes:
+    """N robots to M minibatches: [T, N, ...] becomes [M, T, N / M, ...], [N, H] [M, N / M, H]."""
+
+    def split(array: Array, axis: int) -> Array:
+        shape = array.shape
+        grouped = array.reshape(*shape[:axis], -1, num_batches, *shape[axis + 1 :])
+        return jnp.moveaxis(grouped, axis + 1, 0)
+
+    return Episodes(
+        obs=jax.tree.map(partial(split, axis=1), episodes.obs),
+        actions=split(episodes.actions, 1),
+        rewards=split(episodes.rewards, 1),
+        terminated=split(episodes.terminated, 1),
+        carry=split(episodes.carry, 0),
+    )
 
 
 def _update(

@@ -7,12 +7,14 @@ first step on, the recurrent state starts at zero as it did on the robot.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from flax import struct
 from jax import Array
 
 from sqn_jax.agent import replay
@@ -24,30 +26,48 @@ from sqn_jax.agent.replay import ReplayState
 from sqn_jax.config import TrainConfig
 
 
-def pack(episodes: Episodes) -> Episodes:
-    """Time-major float episodes to compact items [N, T, ...].
+@struct.dataclass
+class PackedEpisodes:
+    """Whole episodes as stored: robot-major, 81 bytes a step."""
 
-    Ranges take 8 bits (steps of 2 cm), the goal 16, an action 8: 80 bytes a step.
-    """
-    compact = episodes.replace(
-        obs=episodes.obs.replace(
+    obs: Any
+    """`ranges` [N, T + 1, R] uint8, steps of 2 cm; `goal` [N, T + 1, G] uint16."""
+    actions: Array
+    """[N, T] uint8."""
+    rewards: Array
+    """[N, T] float32."""
+    terminated: Array
+    """[N, T] bool."""
+
+
+def pack(episodes: Episodes) -> PackedEpisodes:
+    """Whole time-major episodes to compact items."""
+    compact = PackedEpisodes(
+        obs=dataclasses.replace(
+            episodes.obs,
             ranges=jnp.round(episodes.obs.ranges * 255).astype(jnp.uint8),
             goal=jnp.round(episodes.obs.goal * 65535).astype(jnp.uint16),
         ),
         actions=episodes.actions.astype(jnp.uint8),
+        rewards=episodes.rewards,
+        terminated=episodes.terminated,
     )
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), compact)
 
 
-def unpack(items: Any) -> Episodes:
-    """The inverse of `pack`, to the rounding of the integers."""
-    episodes = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), items)
-    return episodes.replace(
-        obs=episodes.obs.replace(
-            ranges=episodes.obs.ranges.astype(jnp.float32) / 255,
-            goal=episodes.obs.goal.astype(jnp.float32) / 65535,
+def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
+    """The inverse of `pack`, to the rounding of the integers; the recurrent state is zero."""
+    compact = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), items)
+    return Episodes(
+        obs=dataclasses.replace(
+            compact.obs,
+            ranges=compact.obs.ranges.astype(jnp.float32) / 255,
+            goal=compact.obs.goal.astype(jnp.float32) / 65535,
         ),
-        actions=episodes.actions.astype(jnp.int32),
+        actions=compact.actions.astype(jnp.int32),
+        rewards=compact.rewards,
+        terminated=compact.terminated,
+        carry=jnp.zeros((compact.actions.shape[1], hidden_size)),
     )
 
 
@@ -100,7 +120,7 @@ def _update(
         priority_exponent=settings.priority_exponent if settings.prioritized else 0.0,
         importance_exponent=settings.importance_exponent if settings.prioritized else 0.0,
     )
-    episodes = unpack(items)
+    episodes = unpack(items, config.network.hidden_size)
 
     def loss_function(params: Any) -> Any:
         return r2d2_loss(params, state.target_params, network, episodes, weights, config.learner)

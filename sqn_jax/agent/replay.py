@@ -6,6 +6,7 @@ divides the capacity, so that a block is one contiguous write.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import chex
@@ -59,7 +60,8 @@ def add(state: ReplayState, items: Any) -> ReplayState:
     def write(stored: Array, new: Array) -> Array:
         return jax.lax.dynamic_update_slice_in_dim(stored, new, state.position, axis=0)
 
-    return state.replace(
+    return dataclasses.replace(
+        state,
         storage=jax.tree.map(write, state.storage, items),
         priorities=write(state.priorities, jnp.full(block, state.max_priority)),
         position=(state.position + block) % capacity,
@@ -108,7 +110,8 @@ def sample(
 def update_priorities(state: ReplayState, places: Array, priorities: Array) -> ReplayState:
     """Set the priorities [B] of places [B]; of a place drawn twice, one of the two holds."""
     priorities = jnp.maximum(priorities, 1e-6)
-    return state.replace(
+    return dataclasses.replace(
+        state,
         priorities=state.priorities.at[places].set(priorities),
         max_priority=jnp.maximum(state.max_priority, priorities.max()),
     )

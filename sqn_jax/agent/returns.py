@@ -17,7 +17,7 @@ RESCALING_EPSILON = 1e-3
 
 
 def rescale(value: Array) -> Array:
-    """The invertible squashing h of R2D2, eq. 1 (Pohlen et al. 2018): sign(x)(sqrt(|x|+1)-1)+eps x."""
+    """The invertible squashing h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x (R2D2, eq. 1)."""
     return jnp.sign(value) * (jnp.sqrt(jnp.abs(value) + 1) - 1) + RESCALING_EPSILON * value
 
 
@@ -59,9 +59,7 @@ def n_step_targets(rewards: Array, discounts: Array, values: Array, *, n_step: i
     return targets
 
 
-def lambda_targets(
-    rewards: Array, discounts: Array, values: Array, *, trace_decay: float
-) -> Array:
+def lambda_targets(rewards: Array, discounts: Array, values: Array, *, trace_decay: float) -> Array:
     """Q(lambda) returns without cutting (Peng and Williams 1996; PQN, Gallici et al. 2024).
 
     G_t = r_t + g_t [(1 - lambda) V_{t+1} + lambda G_{t+1}] with G_T = V_T. lambda = 0 is one-step
@@ -84,7 +82,5 @@ def lambda_targets(
         target = reward + discount * ((1 - trace_decay) * value + trace_decay * later)
         return target, target
 
-    _, targets = jax.lax.scan(
-        backward, values[-1], (rewards, discounts, values[1:]), reverse=True
-    )
+    _, targets = jax.lax.scan(backward, values[-1], (rewards, discounts, values[1:]), reverse=True)
     return targets

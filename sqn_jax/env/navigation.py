@@ -160,9 +160,7 @@ def field_of_view(params: EnvParams) -> float:
     return math.radians(params.config.field_of_view_deg)
 
 
-def _add_scan(
-    covered: Array, pose: Array, ranges: Array, params: EnvParams
-) -> tuple[Array, Array]:
+def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> tuple[Array, Array]:
     return coverage.add_scan(
         covered,
         pose,

@@ -61,9 +61,7 @@ def make_env(
         sight=_ray_grid(
             occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
         ),
-        body=_ray_grid(
-            ~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)
-        ),
+        body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
         commands=jnp.array(

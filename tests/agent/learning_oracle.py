@@ -161,13 +161,14 @@ def lambda_return(
 
 @dataclass
 class Batch:
-    """Episodes [T (+ 1), B, ...] in float64."""
+    """Episodes [T (+ 1), B, ...] in float64, and the recurrent state [B, H] they begin with."""
 
     ranges: FLOATS
     goal: FLOATS
     actions: NDArray[np.int64]
     rewards: FLOATS
     terminated: NDArray[np.bool_]
+    carry: FLOATS
 
 
 def r2d2_loss(
@@ -241,8 +242,7 @@ def after_burn_in(
     algo: str, params: Tree, burn_in_params: Tree, batch: Batch, burn_in_length: int
 ) -> tuple[FLOATS, FLOATS]:
     """Q-values [T' + 1, B, A] of the steps after burn-in, and the carry they began with."""
-    size = params["params"]["features"]["goal"]["output"]["bias"].shape[0]
-    carry = np.zeros((batch.rewards.shape[1], size))
+    carry = batch.carry
     if burn_in_length > 0:
         early = slice(0, burn_in_length)
         carry = forward(algo, burn_in_params, batch.ranges[early], batch.goal[early], carry).carry

@@ -42,9 +42,9 @@ def random_obs(rng: np.random.Generator, length: int, batch: int) -> Seen:
     )
 
 
-def random_params(network: QNetwork, rng: np.random.Generator) -> Any:
+def random_params(network: QNetwork, rng: np.random.Generator, obs: Any = None) -> Any:
     """Every parameter random, those too that start at zero, one or close to it."""
-    obs = random_obs(rng, 1, 1)
+    obs = random_obs(rng, 1, 1) if obs is None else jax.tree.map(lambda x: x[:1, :1], obs)
     carry = jnp.zeros((1, network.config.hidden_size))
     shapes = jax.eval_shape(network.init, jax.random.key(0), obs, carry)
 
@@ -59,12 +59,24 @@ def random_params(network: QNetwork, rng: np.random.Generator) -> Any:
 def random_episodes(
     rng: np.random.Generator, length: int, batch: int, *, terminated: float = 0.0
 ) -> Episodes:
-    """Episodes whose steps end truly with the given chance."""
+    """Steps that end truly with the given chance, driven with a recurrent state in mid-way."""
     return Episodes(
         obs=random_obs(rng, length + 1, batch),
         actions=jnp.asarray(rng.integers(0, NUM_ACTIONS, (length, batch)), jnp.int32),
         rewards=jnp.asarray(rng.normal(size=(length, batch)), jnp.float32),
         terminated=jnp.asarray(rng.random((length, batch)) < terminated),
+        carry=jnp.asarray(rng.normal(size=(batch, HIDDEN)), jnp.float32),
+    )
+
+
+def of_robots(episodes: Episodes, robots: Any) -> Episodes:
+    """The episodes of some robots only, field by field."""
+    return Episodes(
+        obs=Seen(episodes.obs.ranges[:, robots], episodes.obs.goal[:, robots]),
+        actions=episodes.actions[:, robots],
+        rewards=episodes.rewards[:, robots],
+        terminated=episodes.terminated[:, robots],
+        carry=episodes.carry[robots],
     )
 
 
@@ -80,4 +92,5 @@ def as_batch(episodes: Episodes) -> Batch:
         actions=np.asarray(episodes.actions, np.int64),
         rewards=np.asarray(episodes.rewards, np.float64),
         terminated=np.asarray(episodes.terminated),
+        carry=np.asarray(episodes.carry, np.float64),
     )

@@ -196,6 +196,19 @@ def test_the_loss_hangs_on_what_was_seen_in_burn_in_but_sends_no_gradient_there(
     assert abs(r2d2(given, CONFIG)[0] - r2d2(elsewhere, CONFIG)[0]) > 1e-4
 
 
+@pytest.mark.parametrize("method", ["r2d2", "pqn"])
+def test_the_recurrent_state_at_the_beginning_counts(method: str) -> None:
+    given = problem("sqn", layer_norm=method == "pqn")
+    moved = given.episodes.replace(carry=given.episodes.carry + 0.5)
+    losses = []
+    for episodes in (given.episodes, moved):
+        if method == "r2d2":
+            losses.append(r2d2(dataclasses.replace(given, episodes=episodes), CONFIG)[0])
+        else:
+            losses.append(float(pqn_value(given.params, given.network, episodes, CONFIG)[0]))
+    assert abs(losses[0] - losses[1]) > 1e-4
+
+
 def test_what_was_done_and_earned_in_burn_in_does_not_matter() -> None:
     given = problem("sqn")
     episodes = given.episodes

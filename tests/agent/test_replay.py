@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from small_problems import NUM_ACTIONS, Seen, random_episodes
+from small_problems import HIDDEN, Seen, random_episodes
 
 from sqn_jax.agent import Episodes, r2d2, replay
 
@@ -190,7 +190,8 @@ def test_packed_episodes_come_back_to_the_rounding_of_their_integers() -> None:
     assert packed.obs.ranges.dtype == packed.actions.dtype == jnp.uint8
     assert packed.obs.goal.dtype == jnp.uint16
     np.testing.assert_array_equal(packed.actions, np.asarray(episodes.actions).T)
-    back = r2d2.unpack(packed)
+    back = r2d2.unpack(packed, HIDDEN)
+    assert not np.asarray(back.carry).any(), "a stored episode begins without a memory"
     assert jax.tree.map(lambda x: (x.shape, x.dtype), back) == jax.tree.map(
         lambda x: (x.shape, x.dtype), episodes
     )
@@ -209,12 +210,11 @@ def test_episodes_survive_the_replay_in_order() -> None:
     items, places, _ = sample(
         jax.random.key(10), state, 4, priority_exponent=0.9, importance_exponent=0.6
     )
-    drawn = r2d2.unpack(items)
+    drawn = r2d2.unpack(items, HIDDEN)
     robots = np.asarray(places) % 3
     np.testing.assert_array_equal(drawn.actions, episodes.actions[:, robots])
     np.testing.assert_array_equal(drawn.rewards, episodes.rewards[:, robots])
     np.testing.assert_allclose(drawn.obs.goal, episodes.obs.goal[:, robots], atol=1e-5)
-    assert NUM_ACTIONS <= 256
 
 
 def test_the_replay_of_the_paper_takes_less_than_half_a_gigabyte() -> None:
@@ -226,6 +226,7 @@ def test_the_replay_of_the_paper_takes_less_than_half_a_gigabyte() -> None:
         actions=shape(400, 50, dtype=jnp.int32),
         rewards=shape(400, 50),
         terminated=shape(400, 50, dtype=jnp.bool_),
+        carry=shape(50, 128),
     )
     # 71 ranges of 1 byte and two numbers of 2 bytes at each of 401 observations; action, reward
     # and end in 1, 4 and 1 bytes at each of 400 steps; a priority of 4 bytes.

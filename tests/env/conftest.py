@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from driving import Drive, drive
-from grid_oracle import BOOLS, random_map, wrap_map
+from grid_oracle import BOOLS, open_map, random_map, wrap_map
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env
@@ -19,18 +19,21 @@ def maze() -> OccupancyMap:
 
 
 @pytest.fixture(scope="session")
-def cluttered() -> OccupancyMap:
-    """A map of 120 rows and 210 columns with blocks and pillars of one cell."""
-    occupied = random_map(seed=0, rows=120, columns=210, blocks=25, pillars=60)
+def hall() -> OccupancyMap:
+    """A hall of 10 m x 15 m, 200 rows and 300 columns: a wall, columns, pillars of one cell."""
+    rng = np.random.default_rng(3)
+    occupied = open_map(rows=200, columns=300)
+    occupied[100:104, 60:200] = True
+    for row, column in rng.integers(10, (185, 285), (18, 2)):
+        occupied[row : row + 8, column : column + 8] = True
+    occupied[rng.integers(0, 200, 25), rng.integers(0, 300, 25)] = True
     return wrap_map(occupied, sample_spawn_points(occupied, 0.05, 0.1, count=6))
 
 
 @pytest.fixture(scope="session")
 def thin_walls() -> OccupancyMap:
     """A map of 90 rows and 150 columns with walls one cell thick, along the axes and diagonal."""
-    occupied = np.zeros((90, 150), bool)
-    occupied[[0, -1]] = True
-    occupied[:, [0, -1]] = True
+    occupied = open_map(rows=90, columns=150)
     occupied[20:70, 40] = True
     occupied[45, 60:120] = True
     occupied[:60, 130] = True
@@ -48,9 +51,9 @@ def maze_params(maze: OccupancyMap) -> EnvParams:
 
 
 @pytest.fixture(scope="session")
-def cluttered_params(cluttered: OccupancyMap) -> EnvParams:
-    """The default robot on the cluttered map."""
-    return make_env(cluttered)
+def hall_params(hall: OccupancyMap) -> EnvParams:
+    """The default robot in the hall."""
+    return make_env(hall)
 
 
 @pytest.fixture(scope="session")
@@ -60,29 +63,28 @@ def maze_drive(maze_params: EnvParams) -> Drive:
 
 
 @pytest.fixture(scope="session")
-def cluttered_drive(cluttered_params: EnvParams) -> Drive:
-    """Whole episodes on the cluttered map."""
-    return drive(cluttered_params, seed=1, robots=16)
+def hall_drive(hall_params: EnvParams) -> Drive:
+    """Whole episodes in the hall."""
+    return drive(hall_params, seed=1, robots=16)
 
 
 @pytest.fixture(
     scope="session",
-    params=["maze", "clutter", "thin walls, point", "thin walls, noise", "clutter, wide, noise"],
+    params=["maze", "hall", "thin walls, point robot, noise", "clutter, wide robot, noise"],
 )
 def any_drive(request: pytest.FixtureRequest) -> tuple[BOOLS, float, Drive]:
     """Occupied cells, robot radius m, and whole episodes, with and without noise."""
     if request.param == "maze":
         occupied = request.getfixturevalue("maze").occupied
         return occupied, 0.1, request.getfixturevalue("maze_drive")
-    if request.param == "clutter":
-        occupied = request.getfixturevalue("cluttered").occupied
-        return occupied, 0.1, request.getfixturevalue("cluttered_drive")
-    noise = 0.3 if "noise" in request.param else 0.0
+    if request.param == "hall":
+        occupied = request.getfixturevalue("hall").occupied
+        return occupied, 0.1, request.getfixturevalue("hall_drive")
     if request.param.startswith("thin walls"):
         occupancy_map, radius = request.getfixturevalue("thin_walls"), 0.0
     else:
         occupied = random_map(seed=2, rows=160, columns=110, blocks=12, pillars=20)
         points = sample_spawn_points(occupied, 0.05, 0.25, count=6)
         occupancy_map, radius = wrap_map(occupied, points), 0.25
-    params = make_env(occupancy_map, EnvConfig(robot_radius=radius, velocity_noise=noise))
+    params = make_env(occupancy_map, EnvConfig(robot_radius=radius, velocity_noise=0.3))
     return occupancy_map.occupied, radius, drive(params, seed=3, robots=32)

@@ -107,7 +107,7 @@ def seen_areas(
         left, bottom = np.maximum(np.floor((pose[:2] - MAX_RANGE) / spacing), 0).astype(int)
         right, top = np.ceil((pose[:2] + MAX_RANGE) / spacing).astype(int)
         window = seen[bottom:top, left:right]
-        row, column = np.nonzero(~window)
+        row, column = np.divmod(np.flatnonzero(~window), window.shape[1])
         x, y = (column + left + 0.5) * spacing, (row + bottom + 0.5) * spacing
         window[row, column] = sees(pose, reading, x, y)
         areas.append(seen.sum() * spacing**2)

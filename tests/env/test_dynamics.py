@@ -100,12 +100,13 @@ def test_the_five_actions_stand_drive_and_turn(heading: float, act, room_params)
     # 0.1 s at 2.5 m/s are 0.25 m, backwards half of it; 0.1 s at pi rad/s are 0.314 rad.
     start = np.array([1.5, 1.0, heading])
     ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    turn = np.array([0.0, 0.0, 0.1 * np.pi])
     for action, expected in (
         (STAND, start),
         (FORWARD, start + 0.25 * ahead),
         (BACKWARD, start - 0.125 * ahead),
-        (LEFT, start + [0, 0, 0.1 * np.pi]),
-        (RIGHT, start - [0, 0, 0.1 * np.pi]),
+        (LEFT, start + turn),
+        (RIGHT, start - turn),
     ):
         pose, collision = act(start, action, room_params)
         np.testing.assert_allclose(pose, expected, atol=1e-6)
@@ -151,7 +152,8 @@ def test_a_wall_of_one_cell_cannot_be_jumped_at_any_speed(thin_walls) -> None:
             pose, refused = go([x, 2.3, 0.05], [length / 0.1, 0.0], params)
             reaches = length * np.cos(0.05) >= 2.0 - x
             assert refused == reaches
-            assert (pose[0] < 2.0) and (reaches == (pose[0] == np.float32(x)))
+            assert pose[0] < 2.0
+            assert (pose[0] == np.float32(x)) == reaches
 
 
 @pytest.mark.parametrize("velocity", [(2.5, 1.0), (2.5, -4.0), (-1.25, 2.0), (0.7, 1e-4), (2, 0)])

@@ -49,11 +49,11 @@ def random_poses(occupied: BOOLS, resolution: float, count: int) -> FLOATS:
 
 
 @pytest.fixture(scope="module", params=["maze", "wide", "tall", "coarse", "fine"])
-def scans(request: pytest.FixtureRequest, maze: OccupancyMap, cluttered: OccupancyMap) -> Scans:
+def scans(request: pytest.FixtureRequest, maze: OccupancyMap, hall: OccupancyMap) -> Scans:
     if request.param == "maze":
         occupancy_map = maze
     elif request.param == "wide":
-        occupancy_map = cluttered
+        occupancy_map = hall
     else:
         resolution = {"tall": 0.05, "coarse": 0.1, "fine": 0.025}[request.param]
         occupied = random_map(seed=6, rows=230, columns=130, blocks=25, pillars=60)
@@ -81,14 +81,14 @@ def test_no_reading_is_longer_than_the_truth(scans: Scans) -> None:
     assert np.max(scans.readings - truth) < 0.001
 
 
-def test_readings_close_to_cell_borders_are_neither_long_nor_lost(cluttered: OccupancyMap) -> None:
+def test_readings_close_to_cell_borders_are_neither_long_nor_lost(hall: OccupancyMap) -> None:
     rng = np.random.default_rng(5)
-    poses = random_poses(cluttered.occupied, 0.05, 400)
+    poses = random_poses(hall.occupied, 0.05, 400)
     inset = rng.choice([1e-4, 1e-3], (400, 2))
     far_side = rng.integers(0, 2, (400, 2))
     cell = np.floor(poses[:, :2] / 0.05)
     poses[:, :2] = (cell + far_side) * 0.05 + np.where(far_side, -inset, inset)
-    scans = scan_at(cluttered, poses)
+    scans = scan_at(hall, poses)
     x, y = scans.poses[:, :1], scans.poses[:, 1:2]
     truth = cast(scans.occupied, 0.05, x, y, scans.angles())
     longest = longest_reading(scans.occupied, 0.05, x, y, scans.angles())
@@ -97,11 +97,11 @@ def test_readings_close_to_cell_borders_are_neither_long_nor_lost(cluttered: Occ
 
 
 def test_rays_along_axes_and_diagonals_stop_at_the_first_occupied_cell(
-    cluttered: OccupancyMap,
+    hall: OccupancyMap,
 ) -> None:
-    grid = make_env(cluttered).sight
+    grid = make_env(hall).sight
     rng = np.random.default_rng(6)
-    free = np.argwhere(~cluttered.occupied)
+    free = np.argwhere(~hall.occupied)
     cells = free[rng.integers(0, len(free), 200)]
     centres = ((cells[:, ::-1] + 0.5) * 0.05).astype(np.float32)
     # Turns beyond one revolution are as good. Beside a wall a ray hops by two cells only: 120 hops
@@ -117,7 +117,7 @@ def test_rays_along_axes_and_diagonals_stop_at_the_first_occupied_cell(
         diagonal = np.hypot(d_column, d_row)
         for (row, column), reading in zip(cells, np.asarray(readings)[:, i], strict=True):
             steps = 0
-            while not cluttered.occupied[row + steps * d_row, column + steps * d_column]:
+            while not hall.occupied[row + steps * d_row, column + steps * d_column]:
                 steps += 1
             # From the centre of the first cell to the near side, or corner, of the last.
             expected = min((steps - 0.5) * diagonal * 0.05, 5.0)
@@ -141,12 +141,12 @@ def test_nothing_within_range_reads_the_maximal_range() -> None:
     np.testing.assert_allclose(readings, 5.0, rtol=1e-6)
 
 
-def test_a_ray_that_needs_more_hops_than_allowed_is_cut_short(cluttered: OccupancyMap) -> None:
-    params = make_env(cluttered)
-    poses = random_poses(cluttered.occupied, 0.05, 100).astype(np.float32)
+def test_a_ray_that_needs_more_hops_than_allowed_is_cut_short(hall: OccupancyMap) -> None:
+    params = make_env(hall)
+    poses = random_poses(hall.occupied, 0.05, 100).astype(np.float32)
     angles = poses[:, 2:] + BEAMS.astype(np.float32)
     x, y = poses[:, :1], poses[:, 1:2]
-    truth = longest_reading(cluttered.occupied, 0.05, x, y, angles.astype(np.float64))
+    truth = longest_reading(hall.occupied, 0.05, x, y, angles.astype(np.float64))
     shorter = np.zeros_like(truth)
     for iterations in (1, 2, 4):
         readings = jax.vmap(

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_files import write_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from map_files import write_room
 from PIL import Image
 
 from sqn_jax.maps import OccupancyMap, load_map, validate

@@ -1,0 +1,55 @@
+"""The three presets: starting points that `sqn train --preset NAME` chooses between."""
+
+from __future__ import annotations
+
+from sqn_jax.config import (
+    EnvConfig,
+    EvalConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    NetworkConfig,
+    ReplayConfig,
+    TrainConfig,
+)
+
+
+def _quick() -> TrainConfig:
+    """Recurrent PQN within the budget of two CPU cores."""
+    return TrainConfig(
+        method="pqn",
+        total_episodes=56_320,
+        num_envs=256,
+        rounds_per_chunk=2,
+        network=NetworkConfig(layer_norm=True),
+        learner=LearnerConfig(
+            batch_size=32,
+            window_length=50,
+            learning_rate=5e-4,
+            learning_rate_schedule="linear",
+            discount=0.97,
+        ),
+        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+    )
+
+
+def _smoke() -> TrainConfig:
+    """Every part of a run in less than a minute, without learning anything useful."""
+    return TrainConfig(
+        method="pqn",
+        total_episodes=64,
+        num_envs=16,
+        updates_per_round=4,
+        rounds_per_chunk=2,
+        env=EnvConfig(max_steps=60),
+        network=NetworkConfig(layer_norm=True),
+        replay=ReplayConfig(capacity=64, min_episodes=16),
+        learner=LearnerConfig(
+            batch_size=8, learning_rate=1e-3, discount=0.99, window_length=30, burn_in_length=5
+        ),
+        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+        eval=EvalConfig(episodes=8),
+    )
+
+
+PRESETS: dict[str, TrainConfig] = {"quick": _quick(), "paper": TrainConfig(), "smoke": _smoke()}
+"""`quick` is the default, `paper` follows the paper to the letter, `smoke` is for tests."""

@@ -1,0 +1,271 @@
+"""Whole calls of both learn functions against updates made by hand."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from learning_oracle import adam_step
+from small_problems import HIDDEN, of_robots, random_episodes, random_params, small_network
+
+from sqn_jax.agent import Episodes, pqn, r2d2, replay
+from sqn_jax.agent.learner import LearnerState, make_optimizer
+from sqn_jax.agent.loss import pqn_loss, r2d2_loss
+from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
+
+LENGTH = 5
+NETWORK = small_network("sqn")
+METRICS = {"loss", "gradient_norm", "mean_q", "gate_entropy", "skill_distance"}
+
+
+def config_for(method: str, **changes: Any) -> TrainConfig:
+    learner = {
+        "batch_size": 2,
+        "learning_rate": 0.01,
+        "learning_rate_schedule": "linear",
+        "max_grad_norm": 0.5,
+        "burn_in_length": 1,
+        "n_step": 2,
+        "target_update_rate": 0.1,
+        **changes.pop("learner", {}),
+    }
+    settings: dict[str, Any] = {
+        "method": method,
+        "total_episodes": 60,
+        "num_envs": 6,
+        "updates_per_round": 6,
+        "network": NetworkConfig(hidden_size=HIDDEN),
+        "replay": ReplayConfig(capacity=12, min_episodes=6),
+        **changes,
+    }
+    return TrainConfig(**settings, learner=LearnerConfig(**learner))
+
+
+def optimizer_for(config: TrainConfig) -> Any:
+    return make_optimizer(config.learner, total_updates=10)
+
+
+def fresh_state(config: TrainConfig, seed: int, *, use_target: bool) -> LearnerState:
+    rng = np.random.default_rng(seed)
+    params = random_params(NETWORK, rng)
+    return LearnerState(
+        params=params,
+        target_params=random_params(NETWORK, rng) if use_target else None,
+        opt_state=optimizer_for(config).init(params),
+        num_updates=jnp.int32(0),
+    )
+
+
+def learn_with(method: Any, config: TrainConfig) -> Any:
+    """The learn function of a method with everything static bound, compiled."""
+    return jax.jit(
+        partial(method.learn, network=NETWORK, optimizer=optimizer_for(config), config=config)
+    )
+
+
+class HandMadeAdam:
+    """The optimiser of a config in NumPy: linear decay over 10 updates, clipping, Adam."""
+
+    def __init__(self, config: TrainConfig, params: Any) -> None:
+        self.config = config.learner
+        leaves, self.tree = jax.tree.flatten(params)
+        self.leaves = [np.asarray(leaf, np.float64) for leaf in leaves]
+        self.moments = [(np.zeros_like(leaf), np.zeros_like(leaf)) for leaf in self.leaves]
+        self.count = 0
+        self.norms: list[float] = []
+
+    @property
+    def params(self) -> Any:
+        leaves = [jnp.asarray(leaf, jnp.float32) for leaf in self.leaves]
+        return jax.tree.unflatten(self.tree, leaves)
+
+    def update(self, gradient: Any) -> None:
+        gradients = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(gradient)]
+        self.norms.append(np.sqrt(sum((leaf**2).sum() for leaf in gradients)))
+        rate = self.config.learning_rate
+        if self.config.learning_rate_schedule == "linear":
+            rate *= 1 - self.count / 10
+        self.count += 1
+        self.leaves, self.moments = adam_step(
+            self.leaves,
+            gradients,
+            self.moments,
+            self.count,
+            learning_rate=rate,
+            epsilon=self.config.adam_epsilon,
+            max_norm=self.config.max_grad_norm,
+        )
+
+
+def assert_same_params(ours: Any, by_hand: Any, rate: float) -> None:
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(by_hand), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-3 * rate)
+
+
+def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
+    config = config_for("pqn", learner={"num_passes": 2})
+    state = fresh_state(config, 30, use_target=False)
+    episodes = random_episodes(np.random.default_rng(31), LENGTH, 6)
+    new_state, memory, metrics = learn_with(pqn, config)(
+        jax.random.key(0), state, None, episodes
+    )
+    slope = jax.jit(jax.value_and_grad(
+        lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0]
+    ))
+    adam, losses = HandMadeAdam(config, state.params), []
+    # Six robots in minibatches of two: robots 0 and 3, 1 and 4, 2 and 5; then once more.
+    for first in (0, 1, 2, 0, 1, 2):
+        robots = np.array([first, first + 3])
+        loss, gradient = slope(adam.params, of_robots(episodes, robots))
+        losses.append(float(loss))
+        adam.update(gradient)
+    assert min(adam.norms) < 0.5 < max(adam.norms), "clipping is to be seen on and off"
+    assert_same_params(new_state.params, adam.params, 0.01)
+    assert memory is None
+    assert new_state.target_params is None
+    assert int(new_state.num_updates) == 6
+    assert set(metrics) == METRICS
+    np.testing.assert_allclose(metrics["loss"], np.mean(losses), rtol=1e-4)
+    np.testing.assert_allclose(metrics["gradient_norm"], np.mean(adam.norms), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("num_passes", "batch_size"), [(1, 2), (2, 3), (1, 6), (1, 1)])
+def test_pqn_sees_every_episode_equally_often(
+    monkeypatch: pytest.MonkeyPatch, num_passes: int, batch_size: int
+) -> None:
+    config = config_for("pqn", learner={"batch_size": batch_size, "num_passes": num_passes})
+    state = fresh_state(config, 32, use_target=False)
+    episodes = random_episodes(np.random.default_rng(33), LENGTH, 6)
+    seen: list[list[int]] = []
+
+    def note_robots(params: Any, network: Any, part: Episodes, settings: Any) -> None:
+        assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
+        same = (np.asarray(part.rewards)[:, :, None] == np.asarray(episodes.rewards)[:, None]).all(0)
+        robots = [int(np.argmax(row)) for row in same]
+        np.testing.assert_array_equal(part.carry, episodes.carry[np.array(robots)])
+        seen.append(robots)
+
+    def no_step(state: Any, optimizer: Any, loss_function: Any) -> Any:
+        loss_function(state.params)
+        return state, None, {"loss": jnp.float32(0)}
+
+    monkeypatch.setattr(pqn, "pqn_loss", note_robots)
+    monkeypatch.setattr(pqn, "gradient_step", no_step)
+    with jax.disable_jit():
+        pqn.learn(
+            jax.random.key(0), state, None, episodes, NETWORK, optimizer_for(config), config
+        )
+    assert len(seen) == num_passes * 6 // batch_size
+    times = np.bincount(np.concatenate(seen), minlength=6)
+    assert times.tolist() == [num_passes] * 6
+    assert all(len(set(robots)) == batch_size for robots in seen)
+
+
+def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which episodes are drawn is laid down here; all that follows from them is recomputed."""
+    drawn, weights = np.array([4, 1, 4]), np.array([0.5, 1.0, 0.5])
+    asked: list[dict[str, Any]] = []
+
+    def fixed_sample(key: Any, memory: Any, batch_size: int, **exponents: float) -> Any:
+        asked.append({"batch_size": batch_size, **exponents})
+        items = jax.tree.map(lambda x: x[drawn], memory.storage)
+        return items, jnp.asarray(drawn), jnp.asarray(weights, jnp.float32)
+
+    monkeypatch.setattr(r2d2.replay, "sample", fixed_sample)
+    config = config_for("r2d2", updates_per_round=2, learner={"batch_size": 3})
+    state = fresh_state(config, 34, use_target=True)
+    episodes = random_episodes(np.random.default_rng(35), LENGTH, 6, terminated=0.1)
+    memory = replay.init(r2d2.packed_item(episodes), 12)
+    new_state, new_memory, metrics = learn_with(r2d2, config)(
+        jax.random.key(0), state, memory, episodes
+    )
+    assert asked[0] == {"batch_size": 3, "priority_exponent": 0.9, "importance_exponent": 0.6}
+
+    # As stored: coarser observations, and an episode begins without a memory.
+    coarse = episodes.replace(
+        obs=episodes.obs.replace(
+            ranges=jnp.round(episodes.obs.ranges * 255) / 255,
+            goal=jnp.round(episodes.obs.goal * 65535) / 65535,
+        ),
+        carry=jnp.zeros_like(episodes.carry),
+    )
+    part = of_robots(coarse, drawn)
+    slope = jax.jit(jax.value_and_grad(
+        lambda params, target: r2d2_loss(
+            params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), config.learner
+        ),
+        has_aux=True,
+    ))
+    adam, target = HandMadeAdam(config, state.params), state.target_params
+    priorities, losses = np.where(np.arange(12) < 6, 1.0, 0.0), []
+    for _ in range(2):
+        (loss, output), gradient = slope(adam.params, target)
+        losses.append(float(loss))
+        adam.update(gradient)
+        target = jax.tree.map(
+            lambda old, new: jnp.float32(0.9) * old + jnp.float32(0.1) * new, target, adam.params
+        )
+        errors = np.abs(np.asarray(output.td_errors))
+        for column, place in enumerate(drawn):
+            mixed = 0.9 * errors[:, column].max() + 0.1 * errors[:, column].mean()
+            priorities[place] = mixed
+    assert_same_params(new_state.params, adam.params, 0.01)
+    assert_same_params(new_state.target_params, target, 0.01)
+    np.testing.assert_allclose(new_memory.priorities, priorities, rtol=2e-3)
+    assert int(new_memory.size) == 6
+    assert int(new_state.num_updates) == 2
+    assert set(metrics) == METRICS
+    np.testing.assert_allclose(metrics["loss"], np.mean(losses), rtol=1e-4)
+
+
+def test_r2d2_only_stores_until_there_are_enough_episodes() -> None:
+    config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=7))
+    state = fresh_state(config, 36, use_target=True)
+    episodes = random_episodes(np.random.default_rng(37), LENGTH, 6)
+    memory = replay.init(r2d2.packed_item(episodes), 12)
+    learn = learn_with(r2d2, config)
+    waiting, memory, metrics = learn(jax.random.key(0), state, memory, episodes)
+    assert int(memory.size) == 6
+    for before, after in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
+        np.testing.assert_array_equal(before, after)
+    assert set(metrics) == METRICS
+    assert all(np.isnan(value) for value in metrics.values())
+    learning, memory, metrics = learn(jax.random.key(1), waiting, memory, episodes)
+    assert int(memory.size) == 12
+    assert int(learning.num_updates) == 6
+    assert all(np.isfinite(value) for value in metrics.values())
+
+
+def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told() -> None:
+    """Updates of two out of twelve: were the key used again, two priorities at most would move."""
+    config = config_for(
+        "r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False)
+    )
+    state = fresh_state(config, 38, use_target=True)
+    episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
+    memory = replay.init(r2d2.packed_item(episodes), 12)
+    # With priorities obeyed, place 0 alone would be drawn.
+    memory = replay.add(memory, r2d2.pack(episodes))
+    memory = memory.replace(priorities=memory.priorities.at[0].set(1e9))
+    _, after, _ = learn_with(r2d2, config)(jax.random.key(2), state, memory, episodes)
+    before = replay.add(memory, r2d2.pack(episodes)).priorities
+    moved = (np.asarray(after.priorities) != np.asarray(before)).sum()
+    assert 4 <= moved <= 12
+
+
+def test_the_learning_rate_falls_to_zero_over_the_run_or_stays() -> None:
+    params = {"w": jnp.zeros(1)}
+    for schedule, expected in (("linear", [0.01, 0.0075, 0.005, 0.0025, 0]), ("constant", [0.01] * 5)):
+        config = LearnerConfig(learning_rate=0.01, learning_rate_schedule=schedule)
+        optimizer = make_optimizer(config, total_updates=4)
+        opt_state = optimizer.init(params)
+        steps = []
+        for _ in range(5):
+            # A constant gradient far above epsilon: Adam moves by the learning rate itself.
+            updates, opt_state = optimizer.update({"w": jnp.ones(1)}, opt_state, params)
+            steps.append(-float(updates["w"][0]))
+        np.testing.assert_allclose(steps, expected, rtol=1e-4, atol=1e-9)

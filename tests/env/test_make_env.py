@@ -1,0 +1,122 @@
+"""Making an environment: what it refuses, in one line that names the culprit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from grid_oracle import open_map, wrap_map
+
+from sqn_jax.config import EnvConfig
+from sqn_jax.env import make_env
+from sqn_jax.env.dynamics import move
+from sqn_jax.maps import OccupancyMap, save_map
+
+
+def refused(make, *parts: str) -> None:
+    """`make` raises ValueError in one line that holds all the parts."""
+    with pytest.raises(ValueError, match=r"\S") as caught:
+        make()
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def small_map() -> OccupancyMap:
+    """3 m x 2 m, free."""
+    return wrap_map(open_map(rows=40, columns=60), [(1.0, 1.0), (2.0, 1.0)], max_steps=33)
+
+
+def test_an_unknown_map_is_named_with_those_that_are_known() -> None:
+    refused(lambda: make_env("labyrinth"), "labyrinth", "maze")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    refused(lambda: make_env(tmp_path / "none.yaml"), "none.yaml")
+
+
+def test_a_map_may_come_from_a_file_or_from_memory_and_is_the_same(tmp_path: Path) -> None:
+    save_map(small_map(), tmp_path / "small.yaml")
+    from_file, from_memory = make_env(tmp_path / "small.yaml"), make_env(small_map())
+    assert from_file.max_steps == from_memory.max_steps == 33
+    np.testing.assert_array_equal(from_file.sight.rectangles, from_memory.sight.rectangles)
+    np.testing.assert_array_equal(from_file.spawn_positions, from_memory.spawn_positions)
+
+
+def test_a_robot_too_large_for_the_map_is_refused(tmp_path: Path) -> None:
+    save_map(small_map(), tmp_path / "small.yaml")
+    config = EnvConfig(robot_radius=1.5)
+    refused(lambda: make_env(tmp_path / "small.yaml", config), "small.yaml", "1.5")
+    refused(lambda: make_env(small_map(), config), "test", "1.5")
+
+
+def test_a_point_in_an_obstacle_is_named() -> None:
+    spoilt = dataclasses.replace(small_map(), spawn_points=np.array([[1.0, 1.0], [0.01, 1.0]]))
+    refused(lambda: make_env(spoilt), "spawn_points[1]", "0.01")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_beams", 1),
+        ("field_of_view_deg", 0.0),
+        ("field_of_view_deg", 360.0),
+        ("field_of_view_deg", math.nan),
+        ("max_range", 0.0),
+        ("max_range", math.inf),
+        ("time_step", -0.1),
+        ("forward_speed", -1.0),
+        ("backward_speed", math.nan),
+        ("turn_rate", math.inf),
+        ("robot_radius", -0.1),
+        ("goal_radius", 0.0),
+        ("max_goal_distance", 0.0),
+        ("max_steps", -1),
+        ("coverage_cell", 0.0),
+        ("ray_sectors", 6),
+        ("ray_iterations", 0),
+        ("velocity_noise", -0.1),
+        ("range_noise", math.nan),
+        ("reward_time", math.inf),
+    ],
+)
+def test_an_invalid_setting_is_named_with_its_value(name: str, value: float) -> None:
+    refused(lambda: EnvConfig(**{name: value}), f"env.{name}", repr(value), "expected")
+
+
+@pytest.mark.xfail(reason="words are checked when a config is read from a file only")
+@pytest.mark.parametrize("name", ["heading_encoding", "velocity_noise_unit", "range_noise_unit"])
+def test_an_unknown_word_in_a_setting_is_named(name: str) -> None:
+    refused(lambda: EnvConfig(**{name: "polar"}), f"env.{name}", "polar", "expected")
+
+
+@pytest.mark.xfail(reason="any other word than evaluation counts as training")
+def test_an_unknown_kind_of_spawn_is_named() -> None:
+    refused(lambda: make_env(small_map(), spawn="test"), "spawn", "test", "expected")
+
+
+@pytest.mark.xfail(reason="0.3 / 0.05 is below 6 in float64 and 6 in float32")
+def test_a_robot_that_starts_on_the_border_of_a_cell_can_move() -> None:
+    # Free are columns 1 to 5, up to x = 0.3 m: the evaluation point lies on the wall's face.
+    occupied = np.ones((20, 30), bool)
+    occupied[1:-1, 1:6] = False
+    try:
+        params = make_env(
+            wrap_map(occupied, [(0.3, 0.5), (0.2, 0.7)]),
+            EnvConfig(robot_radius=0.0),
+            spawn="evaluation",
+        )
+    except ValueError:
+        return  # Refusing the point would do as well.
+    start = jnp.append(params.spawn_positions[0, 0], jnp.pi)
+    pose, refused = jax.jit(move, static_argnames="iterations")(
+        start, params.commands[1], params.body, time_step=params.time_step, iterations=12
+    )
+    assert not refused
+    assert pose[0] < 0.1
