@@ -122,7 +122,9 @@ def _condense(box: str) -> str:
         if line.startswith("─"):
             break
         message.append(line)
-    return " ".join(message) or "wrong arguments"
+    told = " ".join(message) or "wrong arguments"
+    # "Error parsing learner: learner.n_step is 0, ...": the group is said twice.
+    return re.sub(r"^Error parsing (?:(--\S+: )|\S+: )", r"\1", told)
 
 
 def _default_run_dir(config: TrainConfig, preset: str) -> Path:

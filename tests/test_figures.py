@@ -17,10 +17,12 @@ from PIL import Image
 from sqn_jax import figures
 from sqn_jax.maps import OccupancyMap
 
+FULL_DPI = figures.DPI
+
 
 @pytest.fixture(autouse=True)
 def _coarse_pixels(monkeypatch):
-    """Nothing here depends on the resolution, and rendering gets quicker."""
+    """Rendering gets quicker, and only the layout depends on the resolution."""
     monkeypatch.setattr(figures, "DPI", 60)
 
 
@@ -306,8 +308,9 @@ def test_the_ends_of_the_weight_scale_differ_in_brightness():
 def test_one_skill_has_one_colour_and_no_scale_for_it():
     figure = draw(episodes(GOALS[:1] * 2, [True, False], [12, 30], skills=1))
     assert colorbar_labels(figure) == {"distance to the goal, m"}
-    colours = {to_rgb(c) for axes in panels(figure) for p in paths(axes) for c in p.get_colors()}
-    assert len(colours) == 1
+    drawn_paths = [path for axes in panels(figure) for path in paths(axes)]
+    assert all(path.get_array() is None for path in drawn_paths)
+    assert len({to_rgb(colour) for path in drawn_paths for colour in path.get_colors()}) == 1
 
 
 def test_titles_count_all_episodes_and_average_the_steps_of_the_successes():
@@ -403,8 +406,9 @@ def test_random_pairs_are_chosen_far_apart():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_no_text_overlaps_another(count):
-    """Titles, tick labels, axis labels and the legend, on rendered boxes."""
+def test_no_text_overlaps_another(count, monkeypatch):
+    """Titles, tick labels, axis labels and the legend, on rendered boxes at full resolution."""
+    monkeypatch.setattr(figures, "DPI", FULL_DPI)
     goals = [GOALS[i % count] for i in range(2 * count)]
     figure = draw(episodes(goals, [True, False] * count, [5, 30] * count), max_panels=5)
     check_texts(drawn(figure))
@@ -412,7 +416,8 @@ def test_no_text_overlaps_another(count):
 
 @pytest.mark.parametrize("skills", [1, 4])
 @pytest.mark.parametrize("make", [row, seeds_row])
-def test_no_text_of_a_learning_curve_overlaps_another(skills, make):
+def test_no_text_of_a_learning_curve_overlaps_another(skills, make, monkeypatch):
+    monkeypatch.setattr(figures, "DPI", FULL_DPI)
     rows = [make(chunk) for chunk in range(1, 9)]
     usage = np.broadcast_to(1 / skills, (3, skills)).tolist()
     rows = [r | {"skill_usage": usage if make is seeds_row else usage[0]} for r in rows]
@@ -428,8 +433,11 @@ def tick_labels(axis):
 
 
 def check_texts(figure):
-    """Every visible text lies on the page and apart from all others."""
+    """Every visible text lies on the page and apart from all others; legends leave panels free."""
     renderer = figure.canvas.get_renderer()
+    for legend in figure.legends:
+        frame = legend.get_window_extent(renderer).padded(-1)
+        assert not any(frame.overlaps(axes.get_tightbbox(renderer)) for axes in figure.axes)
     texts = [figure._suptitle, *(text for legend in figure.legends for text in legend.get_texts())]
     for axes in [a for parent in figure.axes for a in (parent, *parent.child_axes)]:
         texts += [axes.title, axes.xaxis.label, axes.yaxis.label, *axes.texts]

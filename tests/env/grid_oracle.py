@@ -109,6 +109,9 @@ def seen_areas(
         window = seen[bottom:top, left:right]
         row, column = np.divmod(np.flatnonzero(~window), window.shape[1])
         x, y = (column + left + 0.5) * spacing, (row + bottom + 0.5) * spacing
+        # Points beyond the longest reading of all need no angle.
+        near = (x - pose[0]) ** 2 + (y - pose[1]) ** 2 <= reading.max() ** 2
+        row, column, x, y = row[near], column[near], x[near], y[near]
         window[row, column] = sees(pose, reading, x, y)
         areas.append(seen.sum() * spacing**2)
     return np.array(areas)

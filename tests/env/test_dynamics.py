@@ -135,8 +135,9 @@ def test_a_refused_move_stops_the_robot(act, room_params) -> None:
 
 def test_a_turn_at_a_wall_still_turns(act, room_params) -> None:
     for action, sign in ((LEFT, 1), (RIGHT, -1)):
-        pose, collision = act([2.945, 1.0, 0.5], action, room_params)
-        np.testing.assert_allclose(pose, [2.945, 1.0, 0.5 + sign * 0.1 * np.pi], atol=1e-6)
+        # 0.3 mm before the wall: turning is no collision, however close.
+        pose, collision = act([2.9497, 1.0, 0.0], action, room_params)
+        np.testing.assert_allclose(pose, [2.9497, 1.0, sign * 0.1 * np.pi], atol=1e-6)
         assert not collision
     # A refused move that also turns, as velocity noise makes it: the turn is made.
     pose, refused = go([2.9, 1.0, 0.0], [2.5, 1.0], room_params)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from driving import Drive, drive
+from grid_oracle import clearance, open_map, wrap_map
 from scipy import ndimage
 
 import sqn_jax
@@ -126,6 +127,24 @@ def test_starts_and_goals_are_traversable_and_connected(
         found |= set(labels[row, column].tolist())
     assert len(found) == 1
     assert 0 not in found
+
+
+def test_starts_and_goals_avoid_walls_and_closed_pockets_near_a_spawn_point() -> None:
+    # A closed box of 0.5 m x 0.5 m inside, 0.3 m east of the first spawn point, 0.25 m from which
+    # to the west runs the outer wall.
+    occupied = open_map(rows=40, columns=80)
+    occupied[14:26, 12:24] = True
+    occupied[15:25, 13:23] = False
+    points = [(0.3, 1.0), (3.0, 1.0)]
+    params = make_env(wrap_map(occupied, points, spawn_radius=0.8))
+    poses, goals = many_tasks(jax.random.split(jax.random.key(8), 500), params)
+    places = np.concatenate([np.asarray(poses)[:, :2], np.asarray(goals)]).astype(np.float64)
+    in_box = np.all((places > [0.6, 0.7]) & (places < [1.2, 1.3]), axis=1)
+    assert not in_box.any()
+    assert clearance(occupied, 0.05, places).min() > 0.0999
+    # Both sides of the wall's surroundings are in reach: the test looks where it matters.
+    assert (np.linalg.norm(places - points[0], axis=1) < 0.8).sum() > 300
+    assert clearance(occupied, 0.05, places).min() < 0.15
 
 
 def test_start_headings_are_uniform_and_places_vary(tasks: tuple[np.ndarray, np.ndarray]) -> None:

@@ -83,9 +83,9 @@ def test_every_term_of_a_scripted_episode_is_what_a_slow_recomputation_gives(
     walled: BOOLS, walled_params: EnvParams
 ) -> None:
     # Towards the wall until it stops the robot, aside, along it, back, and round to the goal.
-    script = [FORWARD] * 14 + [LEFT] * 5 + [FORWARD] * 6 + [STAND, BACKWARD, RIGHT, RIGHT]
+    script = [FORWARD] * 14 + [LEFT] * 5 + [FORWARD] * 9 + [STAND, BACKWARD, RIGHT, RIGHT]
     script += [BACKWARD, FORWARD] + [RIGHT] * 4 + [FORWARD] * 6 + [LEFT, STAND]
-    goal = np.array([8.5, 6.0])
+    goal = np.array([7.6, 6.5])
     _, state = start_at(KEY, jnp.array([3.8, 3.1, 0.05]), jnp.asarray(goal), walled_params)
     poses, records = [np.asarray(state.pose, np.float64)], []
     for action in script:
