@@ -57,11 +57,11 @@ class EnvConfig:
     """Goal heading as one number (psi + pi) / 2 pi, or as sine and cosine scaled to 0..1."""
     max_steps: int = 0
     """Steps an episode; 0 takes the map's own limit (400, in the cave 1200)."""
-    coverage_cell: float = 0.34
+    coverage_cell: float = 0.25
     """Side of the cells on which the covered area is counted, m."""
     ray_sectors: int = 36
     """Directions in the free-space table of the ray caster; a multiple of 4."""
-    ray_iterations: int = 7
+    ray_iterations: int = 8
     """Free rectangles a ray may cross before its reading is cut short."""
     velocity_noise: float = 0.0
     """Sigma of Gaussian noise on the executed velocity."""
@@ -88,6 +88,7 @@ class EnvConfig:
         for name in ("reward_navigation", "reward_exploration", "reward_time"):
             value = getattr(self, name)
             _require(math.isfinite(value), f"env.{name}", value, "a finite number")
+        _require_known_words(self, "env")
         _require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
         _require(
             0 < self.field_of_view_deg < 360,
@@ -169,7 +170,9 @@ class LearnerConfig:
     max_grad_norm: float = 40.0
     """Gradients are scaled down to this global norm."""
     discount: float = 0.997
-    """Discount factor gamma."""
+    """Discount factor gamma (at the end of the run, if `discount_start` says otherwise)."""
+    discount_start: float = 0.0
+    """Discount at the start, from where the horizon grows geometrically; 0: constant."""
     value_rescaling: bool = True
     """Learn h(Q) instead of Q (R2D2, eq. 1)."""
     n_step: int = 5
@@ -188,6 +191,7 @@ class LearnerConfig:
     """pqn: how often each step is learned from."""
 
     def __post_init__(self) -> None:
+        _require_known_words(self, "learner")
         for name in ("learning_rate", "adam_epsilon", "max_grad_norm"):
             _require_positive(self, "learner", name)
         for name in ("batch_size", "n_step", "num_passes"):
@@ -196,7 +200,7 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             _require(value >= 0, f"learner.{name}", value, "0 or a positive number")
-        for name in ("discount", "trace_decay"):
+        for name in ("discount", "discount_start", "trace_decay"):
             value = getattr(self, name)
             _require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         rate = self.target_update_rate
@@ -270,8 +274,7 @@ class TrainConfig:
     eval: EvalConfig = field(default_factory=EvalConfig)
 
     def __post_init__(self) -> None:
-        _require(self.algo in ("sqn", "r2d2", "dqn"), "algo", self.algo, "sqn, r2d2 or dqn")
-        _require(self.method in ("r2d2", "pqn"), "method", self.method, "r2d2 or pqn")
+        _require_known_words(self, "")
         _require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
         for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
             value = getattr(self, name)
@@ -308,6 +311,16 @@ class TrainConfig:
     def num_chunks(self) -> int:
         """Calls of the compiled program in the whole run."""
         return self.num_rounds // self.rounds_per_chunk
+
+
+def _require_known_words(config: object, group: str) -> None:
+    """Check every field that is one of a few words."""
+    for name, hint in typing.get_type_hints(type(config)).items():
+        if typing.get_origin(hint) is Literal:
+            words = typing.get_args(hint)
+            value = getattr(config, name)
+            label = f"{group}.{name}" if group else name
+            _require(value in words, label, value, f"one of {', '.join(words)}")
 
 
 def _require_positive(config: object, group: str, name: str) -> None:
@@ -352,9 +365,7 @@ def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
 def _checked(value: Any, hint: Any, label: str) -> Any:
     """Check one leaf against its annotation; whole numbers pass where a float is asked for."""
     if typing.get_origin(hint) is Literal:
-        options = typing.get_args(hint)
-        _require(value in options, label, value, f"one of {', '.join(map(str, options))}")
-        return value
+        return value  # The dataclass checks its words itself.
     assert not isinstance(hint, types.UnionType), "config fields have one type"
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)

@@ -26,7 +26,15 @@ from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder
-from sqn_jax.train import ChunkReport, RunnerState, compile_chunk, memory_bytes, num_windows, run, start_run
+from sqn_jax.train import (
+    ChunkReport,
+    RunnerState,
+    compile_chunk,
+    memory_bytes,
+    num_windows,
+    run,
+    start_run,
+)
 
 TASKS = {"evaluation points": "evaluation", "random pairs": "training"}
 """What the final evaluation is done on, and the spawn mode that draws it."""
@@ -54,7 +62,9 @@ def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -
     """
     occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
-    num_windows(config, env_params)  # Refuses a window that does not fit before anything is written.
+    num_windows(
+        config, env_params
+    )  # Refuses a window that does not fit before anything is written.
     folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
     _announce(config, env_params, run_dir)
     with Checkpoints(run_dir) as checkpoints:

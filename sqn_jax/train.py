@@ -22,7 +22,7 @@ from jax import Array
 from sqn_jax.agent import pqn, r2d2, replay
 from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
-from sqn_jax.agent.learner import LearnerState, init_learner, make_optimizer
+from sqn_jax.agent.learner import LearnerState, discount_schedule, init_learner, make_optimizer
 from sqn_jax.agent.networks import QNetwork, make_network
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.config import TrainConfig
@@ -129,7 +129,14 @@ def train_round(
     progress = runner.round / config.num_rounds
     epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
     fleet = start_fleet(fleet_key, config.num_envs, network_of(config), env_params)
-    body = partial(_drive_and_learn, epsilon=epsilon, env_params=env_params, config=config)
+    discount = discount_schedule(progress, config.learner)
+    body = partial(
+        _drive_and_learn,
+        epsilon=epsilon,
+        discount=discount,
+        env_params=env_params,
+        config=config,
+    )
     first = (runner.learner, runner.memory, fleet)
     keys = jax.random.split(window_key, windows)
     (learner, memory, _fleet), (traces, learning) = jax.lax.scan(body, first, keys)
@@ -144,6 +151,7 @@ def train_round(
         "updates": learner.num_updates,
         "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
         "epsilon": epsilon_schedule(progress, config.exploration),
+        "discount": jnp.asarray(discount, jnp.float32),
         **jax.tree.map(jnp.mean, learning),
     }
     new_runner = RunnerState(learner=learner, memory=memory, key=key, round=runner.round + 1)
@@ -155,6 +163,7 @@ def _drive_and_learn(
     key: Array,
     *,
     epsilon: Array,
+    discount: Array | float,
     env_params: EnvParams,
     config: TrainConfig,
 ) -> tuple[tuple[LearnerState, Any, Fleet], tuple[Trace, dict[str, Array]]]:
@@ -169,7 +178,7 @@ def _drive_and_learn(
     learn = r2d2.learn if config.method == "r2d2" else pqn.learn
     optimizer = optimizer_of(config, env_params)
     learner, memory, metrics = learn(
-        learn_key, learner, memory, episodes, network, optimizer, config
+        learn_key, learner, memory, episodes, network, optimizer, config, discount
     )
     return (learner, memory, fleet), (trace, metrics)
 

@@ -1,4 +1,4 @@
-"""Every setting refuses what it cannot use, in one line that names it; presets say what they are."""
+"""Settings refuse what they cannot use, in one line that names them; presets hold their values."""
 
 from __future__ import annotations
 

@@ -31,6 +31,20 @@ class LearnerState:
     """int32."""
 
 
+def discount_schedule(progress: Array, config: LearnerConfig) -> Array | float:
+    """The discount at a point of the run, `progress` in 0..1.
+
+    With `discount_start` the horizon 1 / (1 - gamma) grows geometrically from its to that of
+    `discount`: values of a short horizon are learned in a few hundred updates, and those of a
+    longer one start from them (Francois-Lavet et al. 2015, "How to Discount Deep Reinforcement
+    Learning").
+    """
+    if config.discount_start == 0:
+        return config.discount
+    start, end = 1 - config.discount_start, 1 - config.discount
+    return 1 - start * (end / start) ** jnp.clip(progress, 0.0, 1.0)
+
+
 def make_optimizer(config: LearnerConfig, total_updates: int) -> optax.GradientTransformation:
     """Adam with gradients clipped by their global norm and the configured schedule."""
     learning_rate: float | optax.Schedule = config.learning_rate

@@ -37,6 +37,7 @@ def r2d2_loss(
     episodes: Episodes,
     weights: Array,
     config: LearnerConfig,
+    discount: Array | float | None = None,
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error after burn-in, against n-step double-Q targets (R2D2, section 2.3).
 
@@ -51,6 +52,7 @@ def r2d2_loss(
         episodes: [T (+ 1), B, ...].
         weights: [B] importance-sampling weights.
         config: the learner's settings.
+        discount: the discount of the moment; `config.discount` if None.
 
     Returns:
         The loss and its by-products.
@@ -65,11 +67,15 @@ def r2d2_loss(
         lambda x: x[burn_in:], (episodes.actions, episodes.rewards, episodes.terminated)
     )
     multi_step = partial(n_step_targets, n_step=config.n_step)
-    return _squared_error(online, bootstrap, learned, multi_step, weights, config)
+    return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
 
 
 def pqn_loss(
-    params: Params, network: QNetwork, episodes: Episodes, config: LearnerConfig
+    params: Params,
+    network: QNetwork,
+    episodes: Episodes,
+    config: LearnerConfig,
+    discount: Array | float | None = None,
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
 
@@ -81,7 +87,7 @@ def pqn_loss(
     learned = (episodes.actions, episodes.rewards, episodes.terminated)
     multi_step = partial(lambda_targets, trace_decay=config.trace_decay)
     weights = jnp.ones(episodes.rewards.shape[1])
-    return _squared_error(online, bootstrap, learned, multi_step, weights, config)
+    return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
 
 
 def _values_after_burn_in(
@@ -104,10 +110,12 @@ def _squared_error(
     multi_step: Any,
     weights: Array,
     config: LearnerConfig,
+    discount: Array | float | None,
 ) -> tuple[Array, LossOutput]:
     """Compare the taken actions' values with targets built from `bootstrap` [T' + 1, B]."""
     actions, rewards, terminated = learned
-    discounts = config.discount * (1.0 - terminated.astype(jnp.float32))
+    discount = config.discount if discount is None else discount
+    discounts = discount * (1.0 - terminated.astype(jnp.float32))
     if config.value_rescaling:
         bootstrap = inverse_rescale(bootstrap)
     targets = jax.vmap(multi_step, in_axes=1, out_axes=1)(rewards, discounts, bootstrap)

@@ -31,6 +31,7 @@ def learn(
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    discount: Array | float | None = None,
 ) -> tuple[LearnerState, None, dict[str, Array]]:
     """Go through a window of all robots in minibatches, each robot equally often.
 
@@ -40,7 +41,9 @@ def learn(
     del key
     num_batches = config.num_envs // config.learner.batch_size
     batches = split_robots(episodes, num_batches)
-    update = partial(_update, network=network, optimizer=optimizer, config=config)
+    update = partial(
+        _update, network=network, optimizer=optimizer, config=config, discount=discount
+    )
 
     def one_pass(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, Array]]:
         return jax.lax.scan(update, state, batches)
@@ -73,9 +76,10 @@ def _update(
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    discount: Array | float | None,
 ) -> tuple[LearnerState, dict[str, Array]]:
     def loss_function(params: Any) -> Any:
-        return pqn_loss(params, network, episodes, config.learner)
+        return pqn_loss(params, network, episodes, config.learner, discount)
 
     state, _, metrics = gradient_step(state, optimizer, loss_function)
     return state, metrics

@@ -85,10 +85,13 @@ def learn(
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    discount: Array | float | None = None,
 ) -> tuple[LearnerState, ReplayState, dict[str, Array]]:
     """Store a round of episodes and update, once enough are stored; the key is consumed."""
     memory = replay.add(memory, pack(episodes))
-    update = partial(_update, network=network, optimizer=optimizer, config=config)
+    update = partial(
+        _update, network=network, optimizer=optimizer, config=config, discount=discount
+    )
     keys = jax.random.split(key, config.updates_per_round)
 
     def all_updates(carry: Any) -> tuple[Any, dict[str, Array]]:
@@ -110,6 +113,7 @@ def _update(
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    discount: Array | float | None,
 ) -> tuple[tuple[LearnerState, ReplayState], dict[str, Array]]:
     state, memory = carry
     settings = config.replay
@@ -123,7 +127,9 @@ def _update(
     episodes = unpack(items, config.network.hidden_size)
 
     def loss_function(params: Any) -> Any:
-        return r2d2_loss(params, state.target_params, network, episodes, weights, config.learner)
+        return r2d2_loss(
+            params, state.target_params, network, episodes, weights, config.learner, discount
+        )
 
     state, output, metrics = gradient_step(state, optimizer, loss_function)
     state = update_target(state, config.learner.target_update_rate)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from sqn_jax.env.geometry import wrap_angle
-from sqn_jax.env.raycast import RayGrid, cast_rays
+from sqn_jax.env.raycast import RayGrid, cast_rays, is_blocked
 
 
 def move(
@@ -39,13 +39,9 @@ def move(
     clear = cast_rays(
         body_grid, pose[:2], travel[None], max_range=needed + 1e-3, iterations=iterations
     )[0]
-    refused = (length > 0) & (clear < needed)
-    advance = jnp.where(refused, 0.0, chord)
-    new_pose = jnp.stack(
-        [
-            pose[0] + advance * jnp.cos(direction),
-            pose[1] + advance * jnp.sin(direction),
-            wrap_angle(pose[2] + turn),
-        ]
-    )
-    return new_pose, refused
+    step = chord * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
+    # A ray may cut a corner by less than a thousandth of a cell; an end there would be a trap.
+    end = jnp.where(clear < needed, pose[:2], pose[:2] + step)
+    refused = (length > 0) & ((clear < needed) | is_blocked(body_grid, end))
+    position = jnp.where(refused, pose[:2], end)
+    return jnp.append(position, wrap_angle(pose[2] + turn)), refused

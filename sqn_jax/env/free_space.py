@@ -65,15 +65,30 @@ class _Sums:
         np.cumsum(np.cumsum(padded, axis=0), axis=1, out=self.sums[1:, 1:])
 
     def largest_free(self, cosine: float, sine: float) -> NDArray[np.uint16]:
-        """Largest free rectangle from each cell towards +x, +y with about the given slope.
+        """The free rectangle from each cell towards +x, +y that takes a ray of the slope farthest.
 
-        The candidates of a direction are nested, so a binary search finds the largest.
+        Two shapes compete: along the direction with room to spare, since rays start anywhere in
+        the cell, and a strip of one cell's width, which is all there is beside a wall.
         """
         lengths = np.arange(self.reach + 1)
-        # One cell more than the direction itself covers, since rays start anywhere in the cell.
         slack = (lengths > 2).astype(np.int32)
-        widths = np.maximum(np.ceil(lengths * cosine).astype(np.int32) + slack, lengths > 0)
-        heights = np.maximum(np.ceil(lengths * sine).astype(np.int32) + slack, lengths > 0)
+        one = (lengths > 0).astype(np.int32)
+        along_x = np.maximum(np.ceil(lengths * cosine).astype(np.int32) + slack, one)
+        along_y = np.maximum(np.ceil(lengths * sine).astype(np.int32) + slack, one)
+        strip = (lengths, one) if cosine > sine else (one, lengths)
+        width, height = self._longest(along_x, along_y)
+        strip_width, strip_height = self._longest(*strip)
+        better = _advance(strip_width, strip_height, cosine, sine) > _advance(
+            width, height, cosine, sine
+        )
+        width = np.where(better, strip_width, width)
+        height = np.where(better, strip_height, height)
+        return (width + 256 * height).astype(np.uint16)
+
+    def _longest(
+        self, widths: NDArray[np.integer], heights: NDArray[np.integer]
+    ) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        """Width and height [H, W] of the last free one of nested candidates, by binary search."""
         rows, columns = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.int32)
         free = np.zeros(self.shape, np.int32)
         blocked = np.full(self.shape, self.reach + 1, np.int32)
@@ -88,4 +103,11 @@ class _Sums:
             )
             free = np.where(total == 0, np.maximum(free, middle), free)
             blocked = np.where(total == 0, blocked, np.minimum(blocked, middle))
-        return (widths[free] + 256 * heights[free]).astype(np.uint16)
+        return widths[free], heights[free]
+
+
+def _advance(
+    width: NDArray[np.integer], height: NDArray[np.integer], cosine: float, sine: float
+) -> NDArray[np.floating]:
+    """Cells a ray of the given direction goes from the corner to the far side of a rectangle."""
+    return np.minimum(width / cosine, height / sine)

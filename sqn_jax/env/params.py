@@ -32,9 +32,11 @@ class EnvParams:
     goal_radius: Array
     """m."""
     velocity_noise: Array
-    """[2] standard deviation of the noise on forward speed, m/s, and turn rate, rad/s."""
+    """[2] standard deviation of the noise on forward speed, m/s, and turn rate, rad/s; without
+    effect unless `config.velocity_noise` is more than 0, which compiles the noise in."""
     range_noise: Array
-    """Half-width of the uniform noise on the readings; see `EnvConfig.range_noise_unit`."""
+    """Half-width of the uniform noise on the readings; see `EnvConfig.range_noise_unit`. Without
+    effect unless `config.range_noise` is more than 0, which compiles the noise in."""
     reward_weights: Array
     """[3] weights of navigation, exploration and time."""
     config: EnvConfig = struct.field(pytree_node=False)

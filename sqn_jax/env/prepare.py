@@ -15,7 +15,15 @@ from sqn_jax.env import coverage
 from sqn_jax.env.free_space import free_rectangles
 from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
-from sqn_jax.maps import OccupancyMap, connected_components, load_map, traversable, validate
+from sqn_jax.maps import (
+    OccupancyMap,
+    cells_to_points,
+    connected_components,
+    load_map,
+    points_to_cells,
+    traversable,
+    validate,
+)
 
 BODY_SECTORS = 8
 """Directions in the table for collisions; a step is short, so a coarse table does."""
@@ -46,6 +54,8 @@ def make_env(
         400
     """
     config = EnvConfig() if config is None else config
+    if spawn not in ("training", "evaluation"):
+        raise ValueError(f"spawn is {spawn!r}, expected training or evaluation")
     if isinstance(name, OccupancyMap):
         occupancy_map = name
         validate(occupancy_map, config.robot_radius)
@@ -92,6 +102,11 @@ def _ray_grid(
 ) -> RayGrid:
     reach = min(math.ceil(reach_m / resolution), 250)
     height, width = blocked.shape
+    if sectors * height * width >= 2**31:
+        raise ValueError(
+            f"the map has {height} x {width} cells, expected fewer than {2**31 // sectors:,} "
+            f"with env.ray_sectors {sectors}"
+        )
     return RayGrid(
         rectangles=jnp.asarray(free_rectangles(blocked, sectors, reach).reshape(-1)),
         resolution=jnp.float32(resolution),
@@ -107,23 +122,24 @@ def _spawn_positions(
     """Places around each point, [S, M, 2] m and how many are real, [S].
 
     Places are centres of traversable cells within the spawn radius that lie in the connected
-    component of the point's own cell; at evaluation points only the point itself.
+    component of the point's own cell; at evaluation points only the centre of its cell. Centres,
+    since single precision on the device may put a point on a border into the next cell.
     """
     resolution = occupancy_map.resolution
     labels, _ = connected_components(body_free)
     if spawn == "evaluation":
-        return occupancy_map.evaluation_points[:, None, :], np.ones(
-            len(occupancy_map.evaluation_points), np.int64
-        )
+        cells = points_to_cells(occupancy_map.evaluation_points, resolution)
+        return cells_to_points(cells, resolution)[:, None], np.ones(len(cells), np.int64)
     groups = []
     rows, columns = np.nonzero(body_free)
     centres = (np.stack([columns, rows], axis=1) + 0.5) * resolution
     for point in occupancy_map.spawn_points:
-        column, row = np.floor(point / resolution).astype(int)
+        row, column = points_to_cells(point, resolution)
         near = np.hypot(*(centres - point).T) <= occupancy_map.spawn_radius
         same = labels[rows, columns] == labels[row, column]
         group = centres[near & same]
-        groups.append(group if len(group) else point[None])
+        own_cell = cells_to_points([row, column], resolution)[None]
+        groups.append(group if len(group) else own_cell)
     counts = np.array([len(group) for group in groups])
     positions = np.stack([np.resize(group, (counts.max(), 2)) for group in groups])
     return positions, counts

@@ -57,7 +57,7 @@ def cast_rays(
         # A thousandth of a cell beyond the last border, so that rounding cannot fall back.
         inside = travelled + 1e-3
         column, row = jnp.floor(x + cosines * inside), jnp.floor(y + sines * inside)
-        cell = table_start + (row * grid.width + column).astype(jnp.int32)
+        cell = table_start + row.astype(jnp.int32) * grid.width + column.astype(jnp.int32)
         rectangle = grid.rectangles.at[cell].get(mode="promise_in_bounds").astype(jnp.int32)
         to_side = (column + corner_x + sign_x * (rectangle & 255)) * inverse_x
         to_top = (row + corner_y + sign_y * (rectangle >> 8)) * inverse_y
@@ -66,6 +66,13 @@ def cast_rays(
 
     start = jnp.zeros_like(cosines)
     return jax.lax.fori_loop(0, iterations, hop, start) * grid.resolution
+
+
+def is_blocked(grid: RayGrid, position: Array) -> Array:
+    """Whether the cell at a position [2] m is blocked; the position must lie on the map."""
+    column, row = jnp.floor(position / grid.resolution).astype(jnp.int32)
+    cell = row * grid.width + column
+    return grid.rectangles.at[cell].get(mode="promise_in_bounds") == 0
 
 
 def _nonzero(component: Array) -> Array:

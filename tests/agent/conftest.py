@@ -1,4 +1,4 @@
-"""Programs of these tests run once, on tiny arrays: compiling them fast is worth more than speed."""
+"""Programs of these tests run once on tiny arrays: compiling them takes longer than they do."""
 
 from __future__ import annotations
 

@@ -135,9 +135,7 @@ def inverse_rescale(y: float) -> float:
     return (low + high) / 2
 
 
-def n_step_return(
-    rewards: FLOATS, discounts: FLOATS, values: FLOATS, t: int, n_step: int
-) -> float:
+def n_step_return(rewards: FLOATS, discounts: FLOATS, values: FLOATS, t: int, n_step: int) -> float:
     """Up to n rewards from step t on, and the value of wherever that leads."""
     total, factor, place = 0.0, 1.0, t
     while place < len(rewards) and place < t + n_step:

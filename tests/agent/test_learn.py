@@ -111,12 +111,10 @@ def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
     config = config_for("pqn", learner={"num_passes": 2})
     state = fresh_state(config, 30, use_target=False)
     episodes = random_episodes(np.random.default_rng(31), LENGTH, 6)
-    new_state, memory, metrics = learn_with(pqn, config)(
-        jax.random.key(0), state, None, episodes
+    new_state, memory, metrics = learn_with(pqn, config)(jax.random.key(0), state, None, episodes)
+    slope = jax.jit(
+        jax.value_and_grad(lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0])
     )
-    slope = jax.jit(jax.value_and_grad(
-        lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0]
-    ))
     adam, losses = HandMadeAdam(config, state.params), []
     # Six robots in minibatches of two: robots 0 and 3, 1 and 4, 2 and 5; then once more.
     for first in (0, 1, 2, 0, 1, 2):
@@ -145,7 +143,8 @@ def test_pqn_sees_every_episode_equally_often(
 
     def note_robots(params: Any, network: Any, part: Episodes, settings: Any) -> None:
         assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
-        same = (np.asarray(part.rewards)[:, :, None] == np.asarray(episodes.rewards)[:, None]).all(0)
+        # Rewards are random, so that they tell which robot's they are.
+        same = np.asarray(part.rewards[:, :, None] == episodes.rewards[:, None]).all(axis=0)
         robots = [int(np.argmax(row)) for row in same]
         np.testing.assert_array_equal(part.carry, episodes.carry[np.array(robots)])
         seen.append(robots)
@@ -157,9 +156,7 @@ def test_pqn_sees_every_episode_equally_often(
     monkeypatch.setattr(pqn, "pqn_loss", note_robots)
     monkeypatch.setattr(pqn, "gradient_step", no_step)
     with jax.disable_jit():
-        pqn.learn(
-            jax.random.key(0), state, None, episodes, NETWORK, optimizer_for(config), config
-        )
+        pqn.learn(jax.random.key(0), state, None, episodes, NETWORK, optimizer_for(config), config)
     assert len(seen) == num_passes * 6 // batch_size
     times = np.bincount(np.concatenate(seen), minlength=6)
     assert times.tolist() == [num_passes] * 6
@@ -195,12 +192,14 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
         carry=jnp.zeros_like(episodes.carry),
     )
     part = of_robots(coarse, drawn)
-    slope = jax.jit(jax.value_and_grad(
-        lambda params, target: r2d2_loss(
-            params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), config.learner
-        ),
-        has_aux=True,
-    ))
+    slope = jax.jit(
+        jax.value_and_grad(
+            lambda params, target: r2d2_loss(
+                params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), config.learner
+            ),
+            has_aux=True,
+        )
+    )
     adam, target = HandMadeAdam(config, state.params), state.target_params
     priorities, losses = np.where(np.arange(12) < 6, 1.0, 0.0), []
     for _ in range(2):
@@ -243,9 +242,7 @@ def test_r2d2_only_stores_until_there_are_enough_episodes() -> None:
 
 def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told() -> None:
     """Updates of two out of twelve: were the key used again, two priorities at most would move."""
-    config = config_for(
-        "r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False)
-    )
+    config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False))
     state = fresh_state(config, 38, use_target=True)
     episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
     memory = replay.init(r2d2.packed_item(episodes), 12)
@@ -260,7 +257,8 @@ def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told() -> None:
 
 def test_the_learning_rate_falls_to_zero_over_the_run_or_stays() -> None:
     params = {"w": jnp.zeros(1)}
-    for schedule, expected in (("linear", [0.01, 0.0075, 0.005, 0.0025, 0]), ("constant", [0.01] * 5)):
+    falling = [0.01, 0.0075, 0.005, 0.0025, 0]
+    for schedule, expected in (("linear", falling), ("constant", [0.01] * 5)):
         config = LearnerConfig(learning_rate=0.01, learning_rate_schedule=schedule)
         optimizer = make_optimizer(config, total_updates=4)
         opt_state = optimizer.init(params)

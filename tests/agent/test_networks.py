@@ -151,13 +151,13 @@ def test_parameter_counts_are_those_worked_out_by_hand() -> None:
     assert count(paper_sized("r2d2")) == features + gru + hidden + (128 * 5 + 5) == 207_749
     wide = (256 * 384 + 384) + (384 * 384 + 384) + (384 * 5 + 5)
     assert count(paper_sized("dqn")) == features + wide == 291_077
-    # Scale and bias before each ReLU after the features: decision and two skills; one head; two wide.
+    # Scale and bias before each ReLU after the features: in three MLPs, in one, in two wide layers.
     assert count(paper_sized("sqn", layer_norm=True)) == 242_060 + 3 * 2 * 128
     assert count(paper_sized("r2d2", layer_norm=True)) == 207_749 + 2 * 128
     assert count(paper_sized("dqn", layer_norm=True)) == 291_077 + 2 * 2 * 384
 
 
-def test_every_layer_of_the_sqn_is_128_wide_and_the_dqn_three_times_that_after_the_features() -> None:
+def test_layers_are_128_wide_and_those_of_the_dqn_after_the_features_three_times_that() -> None:
     sqn = paper_sized("sqn")["params"]
     assert sqn["features"]["ranges"]["hidden"]["kernel"].shape == (71, 128)
     assert sqn["features"]["goal"]["output"]["kernel"].shape == (128, 128)

@@ -88,10 +88,12 @@ def test_no_edge_of_what_is_in_range_is_lost_with_coarse_cells() -> None:
     # Cells of 1 m are coarse for one scan, but right on average over many places: a lost row or
     # column at the edge would take a segment of the disc, 1.5 m2.
     params = make_env(
-        wrap_map(open_map(260, 280), [(6.5, 6.5), (7.0, 6.5)]), EnvConfig(coverage_cell=1.0)
+        wrap_map(open_map(260, 400), [(6.5, 6.5), (7.0, 6.5)]), EnvConfig(coverage_cell=1.0)
     )
     rng = np.random.default_rng(2)
-    poses = np.column_stack([rng.uniform(5.5, 7.5, (400, 2)), rng.uniform(-np.pi, np.pi, 400)])
+    low, high = [10.5, 5.5, -np.pi], [13.5, 7.5, np.pi]
+    # x so that the scan begins in the last columns of a byte of eight, too.
+    poses = rng.uniform(low, high, (400, 3))
     _, states = jax.jit(jax.vmap(reset_to, in_axes=(None, 0, None, None)))(
         jax.random.key(0), jnp.asarray(poses, jnp.float32), jnp.array([7.0, 5.5]), params
     )

@@ -199,7 +199,6 @@ def test_a_robot_of_some_size_does_not_fit_through_a_gap_for_a_point() -> None:
         assert (pose[0] > 1.6) == fits
 
 
-@pytest.mark.xfail(reason="a corner cut by less than 0.05 mm is not looked at")
 def test_a_move_that_would_end_in_the_corner_of_an_obstacle_is_refused() -> None:
     # The occupied cell's lower left corner is (0.5, 0.5); the way down and to the right passes it
     # at x + y = 1.00002 and ends on the short piece inside.

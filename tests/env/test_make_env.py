@@ -90,18 +90,15 @@ def test_an_invalid_setting_is_named_with_its_value(name: str, value: float) -> 
     refused(lambda: EnvConfig(**{name: value}), f"env.{name}", repr(value), "expected")
 
 
-@pytest.mark.xfail(reason="words are checked when a config is read from a file only")
 @pytest.mark.parametrize("name", ["heading_encoding", "velocity_noise_unit", "range_noise_unit"])
 def test_an_unknown_word_in_a_setting_is_named(name: str) -> None:
     refused(lambda: EnvConfig(**{name: "polar"}), f"env.{name}", "polar", "expected")
 
 
-@pytest.mark.xfail(reason="any other word than evaluation counts as training")
 def test_an_unknown_kind_of_spawn_is_named() -> None:
     refused(lambda: make_env(small_map(), spawn="test"), "spawn", "test", "expected")
 
 
-@pytest.mark.xfail(reason="0.3 / 0.05 is below 6 in float64 and 6 in float32")
 def test_a_robot_that_starts_on_the_border_of_a_cell_can_move() -> None:
     # Free are columns 1 to 5, up to x = 0.3 m: the evaluation point lies on the wall's face.
     occupied = np.ones((20, 30), bool)

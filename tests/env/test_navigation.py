@@ -130,8 +130,8 @@ def test_starts_and_goals_are_traversable_and_connected(
 
 
 def test_starts_and_goals_avoid_walls_and_closed_pockets_near_a_spawn_point() -> None:
-    # A closed box of 0.5 m x 0.5 m inside, 0.3 m east of the first spawn point, 0.25 m from which
-    # to the west runs the outer wall.
+    # 0.3 m east of the first spawn point stands a closed box, free inside; 0.25 m to its west is
+    # the outer wall.
     occupied = open_map(rows=40, columns=80)
     occupied[14:26, 12:24] = True
     occupied[15:25, 13:23] = False

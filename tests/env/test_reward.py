@@ -162,9 +162,7 @@ def test_reachability_is_judged_by_the_beam_nearest_to_the_goal() -> None:
         (-175.1, 0.9, False),
     ):
         heading = jnp.float32(np.deg2rad(bearing))
-        got = goal_is_reachable(
-            jnp.float32(distance), heading, ranges, field_of_view=FIELD_OF_VIEW
-        )
+        got = goal_is_reachable(jnp.float32(distance), heading, ranges, field_of_view=FIELD_OF_VIEW)
         assert bool(got) is expected, (bearing, distance)
 
 
