@@ -71,6 +71,8 @@ class EnvConfig:
     """Half-width p of the uniform noise on the observed ranges."""
     range_noise_unit: Literal["relative", "absolute"] = "relative"
     """Reading x (1 + U(-p, p)), or reading + max_range x U(-p, p)."""
+    near_goal_fraction: float = 0.0
+    """Share of training tasks whose goal lies at one of the spawn points nearest to the start."""
     reward_navigation: float = 2.0
     """Weight of the reachability-aware navigation term (paper eq. 8)."""
     reward_exploration: float = 1.0
@@ -89,6 +91,8 @@ class EnvConfig:
             value = getattr(self, name)
             _require(math.isfinite(value), f"env.{name}", value, "a finite number")
         _require_known_words(self, "env")
+        share = self.near_goal_fraction
+        _require(0 <= share <= 1, "env.near_goal_fraction", share, "a number from 0 to 1")
         _require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
         _require(
             0 < self.field_of_view_deg < 360,

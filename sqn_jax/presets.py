@@ -17,18 +17,20 @@ def _quick() -> TrainConfig:
     """Recurrent PQN within the budget of two CPU cores."""
     return TrainConfig(
         method="pqn",
-        total_episodes=56_320,
+        total_episodes=76_800,
         num_envs=256,
         rounds_per_chunk=2,
+        env=EnvConfig(near_goal_fraction=0.3),
         network=NetworkConfig(layer_norm=True),
         learner=LearnerConfig(
             batch_size=32,
             window_length=50,
             learning_rate=5e-4,
             learning_rate_schedule="linear",
-            discount=0.97,
+            discount_start=0.95,
+            discount=0.985,
         ),
-        exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
+        exploration=ExplorationConfig(epsilon_start=0.4, epsilon_end=0.05, ladder=True),
     )
 
 

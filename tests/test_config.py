@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,18 @@ POSITIVE = {
 }
 AT_MOST_ONE = {
     *("replay.priority_exponent", "replay.importance_exponent", "replay.max_priority_weight"),
-    *("learner.discount", "learner.trace_decay", "learner.target_update_rate"),
-    *("exploration.epsilon_start", "exploration.epsilon_end", "exploration.decay_fraction"),
+    *(
+        "learner.discount",
+        "learner.discount_start",
+        "learner.trace_decay",
+        "learner.target_update_rate",
+    ),
+    *(
+        "env.near_goal_fraction",
+        "exploration.epsilon_start",
+        "exploration.epsilon_end",
+        "exploration.decay_fraction",
+    ),
 }
 
 
@@ -144,6 +154,22 @@ def test_other_values_out_of_range_are_refused(name: str, value: Any) -> None:
     refusal(name, value)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: EnvConfig(heading_encoding="degrees"),
+        lambda: EnvConfig(velocity_noise_unit="percent"),
+        lambda: EnvConfig(range_noise_unit="percent"),
+        lambda: LearnerConfig(learning_rate_schedule="cosine"),
+        lambda: TrainConfig(algo="ppo"),
+        lambda: TrainConfig(method="sarsa"),
+    ],
+)
+def test_an_unknown_word_is_refused_without_a_file_too(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match="expected one of"):
+        make()
+
+
 @pytest.mark.parametrize("name", CHOICES)
 def test_the_refusal_of_a_choice_lists_what_there_is(name: str) -> None:
     message = refusal(name, "nonsense")
@@ -219,7 +245,7 @@ def changed_everywhere() -> TrainConfig:
         network=config_module.NetworkConfig(9, 3, True, 2),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(
-            10, 1e-3, "linear", 1e-8, 2.5, 0.9, False, 3, False, 4, 0.5, 0.125, 11, 2
+            10, 1e-3, "linear", 1e-8, 2.5, 0.9, 0.8, False, 3, False, 4, 0.5, 0.125, 11, 2
         ),
         exploration=config_module.ExplorationConfig(0.9, 0.3, 0.5, True),
         eval=config_module.EvalConfig(12, 34),
@@ -300,7 +326,7 @@ def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     assert env.field_of_view_deg / (env.num_beams - 1) == 5.0
     assert (env.forward_speed, env.backward_speed, env.turn_rate) == (2.5, 1.25, math.pi)
     assert env.time_step == 0.1
-    assert env.velocity_noise == env.range_noise == 0.0
+    assert env.velocity_noise == env.range_noise == env.near_goal_fraction == 0.0
     # The reward (eq. 8).
     assert (env.reward_navigation, env.reward_exploration, env.reward_time) == (2.0, 1.0, 0.2)
     # One update a finished episode, sequences of the map's own length, R2D2 with all its parts.
@@ -310,13 +336,15 @@ def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     assert paper.learner.value_rescaling
     assert paper.replay.prioritized
     assert (paper.learner.discount, paper.learner.n_step) == (0.997, 5)
+    assert paper.learner.discount_start == 0
     assert (paper.replay.priority_exponent, paper.replay.importance_exponent) == (0.9, 0.6)
     assert paper.replay.max_priority_weight == 0.9
 
 
-def test_quick_keeps_the_task_and_the_network_of_the_paper() -> None:
+def test_quick_keeps_the_robot_the_reward_and_the_network_of_the_paper() -> None:
+    """Only which tasks it trains on may differ."""
     quick, paper = PRESETS["quick"], PRESETS["paper"]
-    assert quick.env == paper.env
+    assert dataclasses.replace(quick.env, near_goal_fraction=0.0) == paper.env
     assert quick.algo == paper.algo
     assert dataclasses.replace(quick.network, layer_norm=False) == paper.network
 

@@ -35,12 +35,19 @@ Info = dict[str, Array]
 
 
 def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
-    """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A)."""
-    start_key, goal_key, start_place_key, goal_place_key, heading_key = jax.random.split(key, 5)
+    """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A).
+
+    A share of the tasks, none by default, has its goal near one of the closest spawn points.
+    """
+    keys = jax.random.split(key, 7)
+    start_key, goal_key, start_place_key, goal_place_key, heading_key, near_key, which_key = keys
     num_points = params.spawn_counts.shape[0]
     start_point = jax.random.randint(start_key, (), 0, num_points)
     other = jax.random.randint(goal_key, (), 1, num_points)
-    goal_point = (start_point + other) % num_points
+    neighbors = params.spawn_neighbors[start_point]
+    neighbor = neighbors[jax.random.randint(which_key, (), 0, neighbors.shape[0])]
+    near = jax.random.uniform(near_key) < params.near_goal_fraction
+    goal_point = jnp.where(near, neighbor, (start_point + other) % num_points)
     start = _place_near(start_place_key, start_point, params)
     heading = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
     return jnp.append(start, heading), _place_near(goal_place_key, goal_point, params)

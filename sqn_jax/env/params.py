@@ -25,6 +25,10 @@ class EnvParams:
     """[S, M, 2] m: places to start or finish, grouped by spawn point, padded by repetition."""
     spawn_counts: Array
     """[S] int32: how many of the M places of a spawn point are real."""
+    spawn_neighbors: Array
+    """[S, M'] int32: the spawn points nearest to each, for tasks with a near goal."""
+    near_goal_fraction: Array
+    """Share of such tasks."""
     commands: Array
     """[5, 2] forward speed m/s and turn rate rad/s of each action."""
     time_step: Array

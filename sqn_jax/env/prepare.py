@@ -25,6 +25,9 @@ from sqn_jax.maps import (
     validate,
 )
 
+NUM_NEIGHBORS = 4
+"""Spawn points that count as near a spawn point."""
+
 BODY_SECTORS = 8
 """Directions in the table for collisions; a step is short, so a coarse table does."""
 
@@ -74,6 +77,8 @@ def make_env(
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
+        spawn_neighbors=jnp.asarray(_nearest(positions.mean(axis=1)), jnp.int32),
+        near_goal_fraction=jnp.float32(config.near_goal_fraction),
         commands=jnp.array(
             [
                 [0.0, 0.0],
@@ -114,6 +119,13 @@ def _ray_grid(
         width=width,
         sectors=sectors,
     )
+
+
+def _nearest(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """For each point [S, 2] the indices of the nearest others [S, up to NUM_NEIGHBORS]."""
+    distances = np.hypot(*np.moveaxis(points[:, None] - points[None], -1, 0))
+    np.fill_diagonal(distances, np.inf)
+    return np.argsort(distances, axis=1, kind="stable")[:, : min(NUM_NEIGHBORS, len(points) - 1)]
 
 
 def _spawn_positions(

@@ -69,7 +69,7 @@ def test_each_robot_takes_a_random_action_as_often_as_its_epsilon_says() -> None
 
 
 def test_whether_to_explore_says_nothing_about_the_action_then_taken() -> None:
-    """With one key for both draws, low epsilons would only ever explore the first actions."""
+    """With one number for both draws, low epsilons would only ever explore the first actions."""
     draws = 20_000
     q_values = jnp.tile(jnp.array([[0.0, 0.0, 0.0, 1.0]]), (draws, 1))
     actions = np.asarray(greedy(jax.random.key(2), q_values, jnp.full(draws, 0.2)))

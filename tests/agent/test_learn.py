@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from learning_oracle import adam_step
 from small_problems import HIDDEN, of_robots, random_episodes, random_params, small_network
 
 from sqn_jax.agent import Episodes, pqn, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, make_optimizer
+from sqn_jax.agent.learner import LearnerState, discount_schedule, make_optimizer
 from sqn_jax.agent.loss import pqn_loss, r2d2_loss
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 
@@ -111,9 +112,13 @@ def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
     config = config_for("pqn", learner={"num_passes": 2})
     state = fresh_state(config, 30, use_target=False)
     episodes = random_episodes(np.random.default_rng(31), LENGTH, 6)
-    new_state, memory, metrics = learn_with(pqn, config)(jax.random.key(0), state, None, episodes)
+    # The discount of the moment is not the configured one.
+    new_state, memory, metrics = learn_with(pqn, config)(
+        jax.random.key(0), state, None, episodes, discount=jnp.float32(0.6)
+    )
+    now = dataclasses.replace(config.learner, discount=0.6)
     slope = jax.jit(
-        jax.value_and_grad(lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0])
+        jax.value_and_grad(lambda params, part: pqn_loss(params, NETWORK, part, now)[0])
     )
     adam, losses = HandMadeAdam(config, state.params), []
     # Six robots in minibatches of two: robots 0 and 3, 1 and 4, 2 and 5; then once more.
@@ -141,7 +146,7 @@ def test_pqn_sees_every_episode_equally_often(
     episodes = random_episodes(np.random.default_rng(33), LENGTH, 6)
     seen: list[list[int]] = []
 
-    def note_robots(params: Any, network: Any, part: Episodes, settings: Any) -> None:
+    def note_robots(params: Any, network: Any, part: Episodes, *_: Any) -> None:
         assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
         # Rewards are random, so that they tell which robot's they are.
         same = np.asarray(part.rewards[:, :, None] == episodes.rewards[:, None]).all(axis=0)
@@ -179,7 +184,7 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
     episodes = random_episodes(np.random.default_rng(35), LENGTH, 6, terminated=0.1)
     memory = replay.init(r2d2.packed_item(episodes), 12)
     new_state, new_memory, metrics = learn_with(r2d2, config)(
-        jax.random.key(0), state, memory, episodes
+        jax.random.key(0), state, memory, episodes, discount=jnp.float32(0.6)
     )
     assert asked[0] == {"batch_size": 3, "priority_exponent": 0.9, "importance_exponent": 0.6}
 
@@ -192,10 +197,11 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
         carry=jnp.zeros_like(episodes.carry),
     )
     part = of_robots(coarse, drawn)
+    now = dataclasses.replace(config.learner, discount=0.6)
     slope = jax.jit(
         jax.value_and_grad(
             lambda params, target: r2d2_loss(
-                params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), config.learner
+                params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), now
             ),
             has_aux=True,
         )
@@ -240,19 +246,37 @@ def test_r2d2_only_stores_until_there_are_enough_episodes() -> None:
     assert all(np.isfinite(value) for value in metrics.values())
 
 
-def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told() -> None:
+def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Updates of two out of twelve: were the key used again, two priorities at most would move."""
+    asked: list[dict[str, float]] = []
+    true_sample = replay.sample
+
+    def noting_sample(*args: Any, **exponents: float) -> Any:
+        asked.append(exponents)
+        return true_sample(*args, **exponents)
+
+    monkeypatch.setattr(r2d2.replay, "sample", noting_sample)
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False))
     state = fresh_state(config, 38, use_target=True)
     episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
-    memory = replay.init(r2d2.packed_item(episodes), 12)
-    # With priorities obeyed, place 0 alone would be drawn.
-    memory = replay.add(memory, r2d2.pack(episodes))
-    memory = memory.replace(priorities=memory.priorities.at[0].set(1e9))
+    memory = replay.add(replay.init(r2d2.packed_item(episodes), 12), r2d2.pack(episodes))
     _, after, _ = learn_with(r2d2, config)(jax.random.key(2), state, memory, episodes)
+    assert {"priority_exponent": 0.0, "importance_exponent": 0.0} in asked
+    assert all(exponents == asked[0] for exponents in asked)
     before = replay.add(memory, r2d2.pack(episodes)).priorities
-    moved = (np.asarray(after.priorities) != np.asarray(before)).sum()
-    assert 4 <= moved <= 12
+    assert 4 <= (np.asarray(after.priorities) != np.asarray(before)).sum() <= 12
+
+
+def test_the_horizon_grows_by_equal_factors_or_stays() -> None:
+    # Horizons 1 / (1 - gamma) from 10 steps to 100, over the square root of 1000 in the middle.
+    growing = LearnerConfig(discount_start=0.9, discount=0.99)
+    for progress, horizon in ((0.0, 10.0), (0.5, 1000**0.5), (1.0, 100.0), (1.2, 100.0)):
+        discount = float(discount_schedule(jnp.float32(progress), growing))
+        np.testing.assert_allclose(1 / (1 - discount), horizon, rtol=1e-4)
+    constant = LearnerConfig(discount=0.99)
+    assert discount_schedule(jnp.float32(0.0), constant) == 0.99
 
 
 def test_the_learning_rate_falls_to_zero_over_the_run_or_stays() -> None:

@@ -136,6 +136,21 @@ def test_the_pqn_loss_equals_the_slow_one(changes: dict[str, Any]) -> None:
     np.testing.assert_allclose(loss, expected_loss, rtol=5e-5)
 
 
+@pytest.mark.parametrize("method", ["r2d2", "pqn"])
+def test_a_discount_of_the_moment_takes_the_place_of_the_configured_one(method: str) -> None:
+    given, now = problem("sqn"), jnp.float32(0.6)
+    config = dataclasses.replace(CONFIG, discount=0.6)
+    if method == "r2d2":
+        weights = jnp.asarray(WEIGHTS, jnp.float32)
+        call = (given.params, given.target_params, given.network, given.episodes, weights)
+        loss, _ = r2d2_value(*call, CONFIG, now)
+        expected, _ = r2d2_by_hand(given, config, "sqn")
+    else:
+        loss, _ = pqn_value(given.params, given.network, given.episodes, CONFIG, now)
+        expected, _ = pqn_by_hand(given, config, "sqn")
+    np.testing.assert_allclose(loss, expected, rtol=5e-5)
+
+
 def slope_along(loss: Any, params: Any, direction: Any) -> float:
     """Central difference of a loss along a direction in parameter space."""
     step = 1e-6

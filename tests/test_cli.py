@@ -1,0 +1,129 @@
+"""The command line as a user meets it: exit codes, one clear line, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sqn_jax import session
+from sqn_jax.cli import main
+
+TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4"]
+
+
+def refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
+    """The one line that a refused command prints."""
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("sqn: ")
+    assert told.count("\n") == 1, told
+    assert "Traceback" not in told
+    return told
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["frobnicate"], ["frobnicate", "train", "map"]),
+        (["train", "--preset", "fast"], ["--preset", "fast", "quick"]),
+        (["train", "--bogus", "3"], ["--bogus"]),
+        (["train", "--num-seeds", "0"], ["num_seeds", "0", "at least 1"]),
+        (["train", "--learner.n-step", "0"], ["learner.n_step", "0", "at least 1"]),
+        (["train", "--learner.learning-rate", "abc"], ["--learner.learning-rate", "abc"]),
+        (["train", "--env.max-range", "-1"], ["env.max_range", "-1", "positive"]),
+        (["train", "--algo", "ppo"], ["algo", "ppo", "sqn"]),
+        (["train", "--resume"], ["--resume", "--run-dir"]),
+        (["map", "check"], ["file"]),
+        (["map", "check", "nowhere"], ["nowhere", "maze"]),
+    ],
+)
+def test_wrong_words_are_named_in_one_line(
+    capsys: pytest.CaptureFixture[str], words: list[str], names: list[str]
+) -> None:
+    told = refused(capsys, words)
+    for name in names:
+        assert name in told, (name, told)
+
+
+def test_an_unusable_run_leaves_nothing_behind(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    in_a_file = tmp_path / "file"
+    in_a_file.touch()
+    assert "run folder" in refused(capsys, ["train", *TINY, "--run-dir", str(in_a_file / "run")])
+    run = tmp_path / "run"
+    window = ["--learner.window-length", "7"]
+    assert "window_length" in refused(capsys, ["train", *TINY, *window, "--run-dir", str(run)])
+    assert "nowhere" in refused(capsys, ["train", "--map", "nowhere", "--run-dir", str(run)])
+    assert "holds no run" in refused(capsys, ["train", "--resume", "--run-dir", str(run)])
+    assert not run.exists()
+
+
+def test_the_report_on_a_map_states_its_size_and_distances(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["map", "check", "maze"]) == 0
+    told = capsys.readouterr().out
+    assert "17.00 x 17.00 m" in told
+    assert "340 x 340" in told
+
+
+def metrics_of(run: Path) -> list[dict[str, Any]]:
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    for row in rows:
+        del row["wall_seconds"], row["steps_per_second"]
+    return rows
+
+
+def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    assert main(["train", *TINY, "--run-dir", str(straight)]) == 0
+    told = capsys.readouterr().out
+    assert "evaluation points:" in told
+    assert "random pairs:" in told
+
+    row = session._row
+
+    def row_and_signal(*arguments: Any) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return row(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "_row", row_and_signal)
+        assert main(["train", *TINY, "--run-dir", str(broken)]) == 128 + signal.SIGTERM
+    assert "--resume" in capsys.readouterr().err
+    assert len(metrics_of(broken)) == 1
+    assert not (broken / "summary.json").exists()
+
+    # A row written after the last checkpoint is dropped, not doubled.
+    with (broken / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps({"chunk": 2, "wall_seconds": 0.0, "steps_per_second": 0}) + "\n")
+    assert main(["train", "--resume", "--run-dir", str(broken)]) == 0
+    assert metrics_of(broken) == metrics_of(straight)
+    assert [row["chunk"] for row in metrics_of(broken)] == [1, 2]
+    evaluations = [json.loads((run / "evaluation.json").read_text()) for run in (straight, broken)]
+    assert evaluations[0] == evaluations[1]
+    assert "already holds a run" in refused(capsys, ["train", "--run-dir", str(straight)])
+
+    summary = json.loads((straight / "summary.json").read_text())
+    records = [
+        json.loads(line) for line in (straight / "evaluation.jsonl").read_text().splitlines()
+    ]
+    assert len(records) == 2 * 4
+    for tasks in ("evaluation points", "random pairs"):
+        reached = [record["success"] for record in records if record["tasks"] == tasks]
+        assert summary[tasks.replace(" ", "_")]["success"] == np.mean(reached)
+    drawn = sorted(path.name for path in (straight / "figures").iterdir())
+    assert drawn == [
+        "learning_curve.png",
+        "trajectories_evaluation_points.png",
+        "trajectories_random_pairs.png",
+    ]
