@@ -114,6 +114,7 @@ class Trained:
     final: RunnerState
     metrics: list[Any]
     traces: list[int]
+    keys: list[tuple[int, ...]]
 
 
 def trained(config: TrainConfig, world: EnvParams) -> Trained:
@@ -129,13 +130,15 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "train_round", counted)
         runner, metrics, traces = train.start_run(world, config), [], []
+        keys = [tuple(numbers(runner.key)[0].tolist())]
         for _ in range(config.num_chunks):
             runner, chunk = train.compiled_train_chunk(runner, world, config)
             metrics.append(jax.device_get(chunk))
             traces.append(count)
+            keys.append(tuple(numbers(runner.key)[0].tolist()))
         for _ in train.run(train.start_run(world, config), world, config):
             traces.append(count)
-    return Trained(config, world, runner, metrics, traces)
+    return Trained(config, world, runner, metrics, traces, keys)
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +198,7 @@ def test_another_seed_gives_other_numbers(
 
 def test_rounds_differ_from_each_other(either: Trained) -> None:
     """Were the key not carried on, each round would start its robots at the same places."""
+    assert len(set(either.keys)) == either.config.num_chunks + 1
     rewards = np.concatenate([chunk["mean_reward"] for chunk in either.metrics])
     assert len(set(rewards.tolist())) == either.config.num_rounds
 

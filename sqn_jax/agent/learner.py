@@ -95,7 +95,7 @@ def gradient_step(
     )
     metrics = {
         "loss": loss,
-        "gradient_norm": optax.global_norm(gradient),
+        "gradient_norm": optax.tree.norm(gradient),
         "mean_q": output.mean_q,
         "gate_entropy": output.gate_entropy,
         "skill_distance": output.skill_distance,
