@@ -111,6 +111,7 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     assert [row["chunk"] for row in metrics_of(broken)] == [1, 2]
     evaluations = [json.loads((run / "evaluation.json").read_text()) for run in (straight, broken)]
     assert evaluations[0] == evaluations[1]
+    capsys.readouterr()
     assert "already holds a run" in refused(capsys, ["train", "--run-dir", str(straight)])
 
     summary = json.loads((straight / "summary.json").read_text())
