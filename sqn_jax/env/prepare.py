@@ -134,14 +134,18 @@ def _spawn_positions(
     """Places around each point, [S, M, 2] m and how many are real, [S].
 
     Places are centres of traversable cells within the spawn radius that lie in the connected
-    component of the point's own cell; at evaluation points only the centre of its cell. Centres,
-    since single precision on the device may put a point on a border into the next cell.
+    component of the point's own cell; at evaluation points only the point itself, or the centre
+    of its cell where single precision on the device would put it across a border into an obstacle.
     """
     resolution = occupancy_map.resolution
     labels, _ = connected_components(body_free)
     if spawn == "evaluation":
-        cells = points_to_cells(occupancy_map.evaluation_points, resolution)
-        return cells_to_points(cells, resolution)[:, None], np.ones(len(cells), np.int64)
+        points = occupancy_map.evaluation_points
+        on_device = points.astype(np.float32) / np.float32(resolution)
+        columns, rows = np.floor(on_device).astype(int).T
+        centres = cells_to_points(points_to_cells(points, resolution), resolution)
+        free = body_free[rows, columns]
+        return np.where(free[:, None], points, centres)[:, None], np.ones(len(points), np.int64)
     groups = []
     rows, columns = np.nonzero(body_free)
     centres = (np.stack([columns, rows], axis=1) + 0.5) * resolution
