@@ -140,12 +140,12 @@ def _spawn_positions(
     resolution = occupancy_map.resolution
     labels, _ = connected_components(body_free)
     if spawn == "evaluation":
-        points = occupancy_map.evaluation_points
-        on_device = points.astype(np.float32) / np.float32(resolution)
+        marked = occupancy_map.evaluation_points
+        on_device = marked.astype(np.float32) / np.float32(resolution)
         columns, rows = np.floor(on_device).astype(int).T
-        centres = cells_to_points(points_to_cells(points, resolution), resolution)
+        own_centres = cells_to_points(points_to_cells(marked, resolution), resolution)
         free = body_free[rows, columns]
-        return np.where(free[:, None], points, centres)[:, None], np.ones(len(points), np.int64)
+        return np.where(free[:, None], marked, own_centres)[:, None], np.ones(len(marked), np.int64)
     groups = []
     rows, columns = np.nonzero(body_free)
     centres = (np.stack([columns, rows], axis=1) + 0.5) * resolution
