@@ -1,7 +1,7 @@
 """Saving and loading the state of a run with Orbax.
 
 A checkpoint holds the whole `RunnerState`: parameters, optimiser, replay, keys and the round. The
-parameters stand apart, so that a policy can be loaded without the rest.
+parameters of the policy stand apart, so that it can be loaded without the rest.
 """
 
 from __future__ import annotations
@@ -41,14 +41,8 @@ class Checkpoints:
 
     def save(self, chunk: int, runner: RunnerState) -> None:
         """Write the state after `chunk` chunks; done when this returns."""
-        params, rest = _split(runner)
-        self._manager.save(
-            chunk,
-            args=ocp.args.Composite(
-                params=ocp.args.StandardSave(params), rest=ocp.args.StandardSave(rest)
-            ),
-            force=True,
-        )
+        items = {name: ocp.args.StandardSave(item) for name, item in _split(runner).items()}
+        self._manager.save(chunk, args=ocp.args.Composite(**items), force=True)
         self._manager.wait_until_finished()
 
     def latest(self) -> int | None:
@@ -62,24 +56,25 @@ class Checkpoints:
             ValueError: there is no checkpoint.
         """
         step = self._require_step()
-        params, rest = _split(runner_shapes)
-        loaded = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                params=ocp.args.StandardRestore(params), rest=ocp.args.StandardRestore(rest)
-            ),
-        )
-        return _join(loaded["params"], loaded["rest"])
+        shapes = _split(runner_shapes)
+        items = {name: ocp.args.StandardRestore(item) for name, item in shapes.items()}
+        return _join(self._manager.restore(step, args=ocp.args.Composite(**items)))
 
-    def restore_params(self, params_shapes: Params) -> Params:
-        """Load only the parameters of the newest checkpoint.
+    def restore_policy(self, params_shapes: Params, *, averaged: bool) -> Params:
+        """Load only the parameters to evaluate, from the newest checkpoint.
+
+        Args:
+            params_shapes: the parameters as arrays or structs.
+            averaged: whether the run's policy is the average of its parameters, see
+                `train.averages`.
 
         Raises:
             ValueError: there is no checkpoint.
         """
         step = self._require_step()
-        args = ocp.args.Composite(params=ocp.args.StandardRestore(params_shapes))
-        return self._manager.restore(step, args=args)["params"]
+        name = "target_params" if averaged else "params"
+        args = ocp.args.Composite(**{name: ocp.args.StandardRestore(params_shapes)})
+        return self._manager.restore(step, args=args)[name]
 
     def _require_step(self) -> int:
         step = self._manager.latest_step()
@@ -88,17 +83,21 @@ class Checkpoints:
         return step
 
 
-def _split(runner: RunnerState) -> tuple[Params, Any]:
-    """Parameters, and all else as a plain tree; keys as their raw numbers."""
+def _split(runner: RunnerState) -> dict[str, Any]:
+    """Parameters, their slow copy, and all else as plain trees; keys as their raw numbers."""
     rest = {
-        "target_params": runner.learner.target_params,
         "opt_state": runner.learner.opt_state,
         "num_updates": runner.learner.num_updates,
         "memory": runner.memory,
         "key": _key_data(runner.key),
         "round": runner.round,
     }
-    return runner.learner.params, {name: value for name, value in rest.items() if value is not None}
+    items = {
+        "params": runner.learner.params,
+        "target_params": runner.learner.target_params,
+        "rest": {name: value for name, value in rest.items() if value is not None},
+    }
+    return {name: item for name, item in items.items() if item is not None}
 
 
 def _key_data(key: Any) -> Any:
@@ -107,10 +106,11 @@ def _key_data(key: Any) -> Any:
     return jax.random.key_data(key)
 
 
-def _join(params: Params, rest: dict[str, Any]) -> RunnerState:
+def _join(items: Any) -> RunnerState:
+    rest = items["rest"]
     learner = LearnerState(
-        params=params,
-        target_params=rest.get("target_params"),
+        params=items["params"],
+        target_params=items["target_params"] if "target_params" in items.keys() else None,  # noqa: SIM118
         opt_state=rest["opt_state"],
         num_updates=rest["num_updates"],
     )

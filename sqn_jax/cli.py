@@ -1,4 +1,6 @@
-"""The command line: `sqn train` and `sqn map check`. It wires words to functions, no more.
+"""The command line: `sqn train`, `sqn evaluate` and `sqn map check`.
+
+It wires words to functions, no more.
 
 Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback),
 130 and 143 stopped by SIGINT or SIGTERM after saving.
@@ -18,13 +20,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from tqdm import tqdm
+
 from sqn_jax.config import TrainConfig
 from sqn_jax.presets import PRESETS
 
+PAPER_MAPS = ("maze", "column", "forest", "cave")
+TASKS = {"points": "evaluation points", "pairs": "random pairs"}
+
 USAGE = """usage: sqn COMMAND [OPTIONS]
 
-  sqn train            train a robot, evaluate it, and draw what it did
-  sqn map check FILE   say what a map offers, or what is wrong with it
+  sqn train              train a robot, evaluate it, and draw what it did
+  sqn evaluate RUN ...   compare trained robots on any maps, with noise, beside references
+  sqn map check FILE     say what a map offers, or what is wrong with it
 
 `sqn COMMAND --help` lists the options of a command.
 """
@@ -152,6 +160,82 @@ def _with_absolute_map(config: TrainConfig) -> TrainConfig:
     return config
 
 
+def _evaluate(words: list[str]) -> int:
+    parser = _Parser(
+        prog="sqn evaluate",
+        description="Drive greedy episodes of trained policies; every agent gets the same tasks.",
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", type=Path, metavar="RUN", help="run folders; equal ones but for seeds")
+    add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
+    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=5, help="how many evaluation seeds (default 5)")
+    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--velocity-noise", nargs="+", type=float, default=[], metavar="S", help="e.g. 0.1 0.2")
+    add("--range-noise", nargs="+", type=float, default=[], metavar="P", help="e.g. 0.2 0.4")
+    add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
+    add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
+    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
+    options = parser.parse_args(words)
+    if not options.runs and options.no_references:
+        raise ValueError("nothing to evaluate: name a run folder")
+    from sqn_jax import compare
+    from sqn_jax.policies import load_policy
+    from sqn_jax.runlog import write_json, write_records
+    from sqn_jax.scores import results_table
+
+    noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
+    noise += [(0.0, level) for level in options.range_noise if level != 0]
+    settings = compare.Settings(
+        maps=tuple(options.maps),
+        tasks=tuple(TASKS[word] for word in options.tasks),
+        episodes=options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        noise=((0.0, 0.0), *noise),
+        noise_unit=options.noise_unit,
+        goal_radii=tuple(options.goal_radius),
+    )
+    if options.out is not None:
+        _require_writable(options.out)
+    learnt = compare.group_policies([load_policy(path) for path in options.runs])
+    agents = compare.with_references(learnt, references=not options.no_references)
+    with _evaluation_bar(compare.num_episodes(agents, settings)) as bar:
+        evaluation, records = compare.evaluate_agents(agents, settings, bar.update)
+    print(results_table(evaluation["results"]))
+    for told in evaluation["comparisons"]:
+        low, high = told["ci95"]
+        print(
+            f"{told['first']} beats {told['second']} with probability "
+            f"{told['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
+        )
+    if options.out is not None:
+        write_json(options.out, evaluation)
+        write_records(options.out.with_suffix(".jsonl"), records)
+        print(f"wrote {options.out}")
+    return 0
+
+
+def _require_writable(path: Path) -> None:
+    if path.suffix != ".json":
+        raise ValueError(f"--out is {path}, expected a file ending in .json")
+    if not path.parent.is_dir() or path.is_dir():
+        raise ValueError(f"--out {path}: expected a file in an existing folder")
+
+
+def _evaluation_bar(num_episodes: int) -> tqdm[NoReturn]:
+    return tqdm(
+        total=num_episodes,
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        dynamic_ncols=True,
+        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
+        "[{elapsed}, {remaining} left]",
+    )
+
+
 def _map(words: list[str]) -> int:
     parser = _Parser(prog="sqn map", description="Look at maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
@@ -166,4 +250,8 @@ def _map(words: list[str]) -> int:
     return 0
 
 
-_COMMANDS: dict[str, Callable[[list[str]], int]] = {"train": _train, "map": _map}
+_COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": _train,
+    "evaluate": _evaluate,
+    "map": _map,
+}

@@ -4,8 +4,7 @@ A config is static: it is hashable, decides shapes and branches, and is passed t
 as a static argument. Numbers that one might sweep inside one program (speeds, noise, reward
 weights) are copied from `EnvConfig` into the traced `EnvParams` when an environment is made.
 
-The defaults follow "Skill Q-Network: Learning Adaptive Skill Ensemble for Mapless Navigation in
-Unknown Environments", section IV-D; where the paper is silent, docs/ARCHITECTURE.md states the
+The defaults follow the paper (section IV-D); where it is silent, docs/ARCHITECTURE.md states the
 value chosen and why. The other presets stand in `presets.py`.
 """
 
@@ -83,16 +82,15 @@ class EnvConfig:
     def __post_init__(self) -> None:
         for name in ("max_range", "time_step", "goal_radius", "max_goal_distance", "coverage_cell"):
             _require_positive(self, "env", name)
-        for name in ("forward_speed", "backward_speed", "turn_rate", "robot_radius"):
-            _require_not_negative(self, "env", name)
-        for name in ("velocity_noise", "range_noise"):
+        speeds_and_size = ("forward_speed", "backward_speed", "turn_rate", "robot_radius")
+        for name in (*speeds_and_size, "velocity_noise", "range_noise"):
             _require_not_negative(self, "env", name)
         for name in ("reward_navigation", "reward_exploration", "reward_time"):
             value = getattr(self, name)
             _require(math.isfinite(value), f"env.{name}", value, "a finite number")
         _require_known_words(self, "env")
-        share = self.near_goal_fraction
-        _require(0 <= share <= 1, "env.near_goal_fraction", share, "a number from 0 to 1")
+        value = self.near_goal_fraction
+        _require(0 <= value <= 1, "env.near_goal_fraction", value, "a number from 0 to 1")
         _require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
         _require(
             0 < self.field_of_view_deg < 360,
@@ -189,10 +187,14 @@ class LearnerConfig:
     """r2d2: Polyak coefficient tau of the target network."""
     trace_decay: float = 0.8
     """pqn: lambda of the Q(lambda) returns."""
+    average_share: float = 0.0
+    """pqn: evaluate the parameters averaged over the last share of all updates; 0: the latest."""
     window_length: int = 0
     """pqn: steps driven between updates, a divisor of the episode; 0 is the whole episode."""
     num_passes: int = 1
     """pqn: how often each step is learned from."""
+    restart_at_goal: bool = False
+    """pqn: a robot that is at its goal at the end of a window gets a new task."""
 
     def __post_init__(self) -> None:
         _require_known_words(self, "learner")
@@ -204,11 +206,11 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             _require(value >= 0, f"learner.{name}", value, "0 or a positive number")
-        for name in ("discount", "discount_start", "trace_decay"):
+        for name in ("discount", "discount_start", "trace_decay", "average_share"):
             value = getattr(self, name)
             _require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
-        rate = self.target_update_rate
-        _require(0 < rate <= 1, "learner.target_update_rate", rate, "more than 0, at most 1")
+        value = self.target_update_rate
+        _require(0 < value <= 1, "learner.target_update_rate", value, "more than 0, at most 1")
 
 
 @dataclass(frozen=True)
@@ -335,9 +337,7 @@ def _require_positive(config: object, group: str, name: str) -> None:
 
 def _require_not_negative(config: object, group: str, name: str) -> None:
     value = getattr(config, name)
-    _require(
-        math.isfinite(value) and value >= 0, f"{group}.{name}", value, "0 or a positive number"
-    )
+    _require(0 <= value < math.inf, f"{group}.{name}", value, "0 or a positive number")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

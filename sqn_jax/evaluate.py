@@ -1,7 +1,13 @@
-"""Greedy episodes of a trained policy, without exploration and without auto-reset."""
+"""Greedy episodes of a trained policy, without exploration and without auto-reset.
+
+Episodes are driven in lanes, `LANES` at a time whatever is asked for: an episode then comes out
+the same bit for bit whether it is driven alone or beside others.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,95 +16,135 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from sqn_jax.agent.networks import Params, make_network
+from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.config import Algorithm, NetworkConfig
-from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.rollout import EpisodeSummary, Trace, start_fleet, summarize, unroll
-from sqn_jax.statistics import bootstrap_interval, wilson_interval
+from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation, navigation
+from sqn_jax.rollout import EpisodeSummary, Fleet, Trace, start_fleet, summarize, unroll
+
+LANES = 100
+"""Episodes that are driven side by side."""
 
 
-@partial(jax.jit, static_argnames=("algo", "network_config", "num_episodes"))
+def episode_keys(key: Array, num_episodes: int) -> Array:
+    """One key [E] for each episode; the first ones are the same however many are asked for."""
+    return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_episodes))
+
+
+def start_episode(key: Array, network: QNetwork, env_params: EnvParams) -> tuple[Array, Fleet]:
+    """Start, goal and first observation of the episode of a key, as a fleet of one robot.
+
+    Returns:
+        The key to drive it with, and the robot.
+    """
+    start_key, drive_key = jax.random.split(key)
+    return drive_key, start_fleet(start_key, 1, network, env_params)
+
+
 def run_episodes(
-    key: Array,
+    keys: Array,
     params: Params,
     env_params: EnvParams,
     *,
     algo: Algorithm,
     network_config: NetworkConfig,
-    num_episodes: int,
-) -> tuple[EpisodeSummary, Trace]:
+    goal_radii: Sequence[float] = (),
+    on_batch: Callable[[int], object] | None = None,
+) -> tuple[list[EpisodeSummary], Trace]:
     """Drive greedy episodes of one policy.
 
-    Starts, goals and noise come from the key alone: every policy that is given the same key and
+    Starts, goals and noise come from the keys alone: every policy that is given the same keys and
     the same world meets the same tasks.
 
     Args:
-        key: consumed; independent of any training key.
+        keys: [E] from `episode_keys`; independent of any training key.
         params: parameters of one network, without a seed axis.
         env_params: the world, with the noise it was made with.
         algo: which network the parameters belong to.
         network_config: its sizes.
-        num_episodes: E.
+        goal_radii: m, what counts as reaching the goal; by default only `env_params.goal_radius`.
+        on_batch: called after each batch with the number of episodes it held.
 
     Returns:
-        One number an episode [E], and the traces of all of them.
+        For each radius one number an episode [E], and the traces of all episodes; NumPy arrays.
     """
-    start_key, unroll_key = jax.random.split(key)
-    network = make_network(algo, network_config, NUM_ACTIONS)
-    fleet = start_fleet(start_key, num_episodes, network, env_params)
-    _, _, trace = unroll(
-        unroll_key,
-        network,
-        params,
-        fleet,
-        jnp.zeros(num_episodes),
-        env_params,
-        num_steps=env_params.max_steps,
+    radii = jnp.asarray(goal_radii or [env_params.goal_radius], jnp.float32)
+    batches = []
+    for first in range(0, len(keys), LANES):
+        batch = keys[first : first + LANES]
+        lanes = batch[jnp.arange(LANES) % len(batch)]
+        driven = _drive(lanes, params, env_params, radii, algo=algo, network_config=network_config)
+        batches.append(_episodes(jax.device_get(driven), slice(len(batch))))
+        if on_batch is not None:
+            on_batch(len(batch))
+    summary, trace = jax.tree.map(
+        lambda axis, *parts: np.concatenate(parts, axis), _EPISODE_AXES, *batches
     )
-    return summarize(trace, env_params.goal_radius), trace
+    return [jax.tree.map(lambda x, i=i: x[i], summary) for i in range(len(radii))], trace
 
 
-def select_seed(params: Params, index: int) -> Params:
-    """Parameters of one of several vmapped seeds."""
-    return jax.tree.map(lambda x: x[index], params)
+_EPISODE_AXES = (
+    EpisodeSummary(**{field.name: 1 for field in dataclasses.fields(EpisodeSummary)}),
+    Trace(**{field.name: int(field.name != "goals") for field in dataclasses.fields(Trace)}),
+)
+"""Where the axis of episodes stands: summaries are [radii, E], traces [T, E, ...], goals [E]."""
 
 
-def aggregate(summaries: list[EpisodeSummary]) -> dict[str, Any]:
-    """Statistics over the episodes of one or more training seeds, ready for JSON.
+@partial(jax.jit, static_argnames=("algo", "network_config"))
+def _drive(
+    keys: Array,
+    params: Params,
+    env_params: EnvParams,
+    goal_radii: Array,
+    *,
+    algo: Algorithm,
+    network_config: NetworkConfig,
+) -> tuple[EpisodeSummary, Trace]:
+    """One batch."""
+    network = make_network(algo, network_config, NUM_ACTIONS)
+
+    def one(key: Array) -> tuple[EpisodeSummary, Trace]:
+        drive_key, fleet = start_episode(key, network, env_params)
+        greedy = jnp.zeros(1)
+        steps = env_params.max_steps
+        trace = unroll(drive_key, network, params, fleet, greedy, env_params, num_steps=steps)[2]
+        summaries = jax.vmap(partial(summarize, trace))(goal_radii)
+        return _episodes((summaries, trace), 0)
+
+    return jax.vmap(one, out_axes=_EPISODE_AXES)(keys)
+
+
+def _episodes(batch: tuple[EpisodeSummary, Trace], chosen: Any) -> tuple[EpisodeSummary, Trace]:
+    """The chosen ones of a batch."""
+    return jax.tree.map(lambda axis, x: x[(slice(None),) * axis + (chosen,)], _EPISODE_AXES, batch)
+
+
+@jax.jit
+def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, Observation, EnvState]:
+    """Start the episodes of `run_episodes`, for a navigator that is no network.
 
     Args:
-        summaries: one for each training seed, as NumPy or JAX arrays [E].
+        keys: [E] from `episode_keys`.
+        env_params: the world.
 
     Returns:
-        `success`, `time_steps` (failures at the limit), `time_steps_success` (None without a
-        success), `mean_reward`, `collisions`, `coverage_m2`: each `mean`, `std` over episodes and
-        a 95 % interval `ci95` over episodes (Wilson for `success`, bootstrap for the others); and
-        `success_per_seed`.
+        The keys [T, E] for `step_by_hand`, first observations and states [E, ...].
     """
-    joined = {
-        name: np.concatenate([np.asarray(getattr(summary, name)) for summary in summaries])
-        for name in ("success", "time_steps", "mean_reward", "collisions", "covered_area")
-    }
-    success = joined["success"]
-    steps = joined["time_steps"]
-    return {
-        "success": {
-            "mean": float(success.mean()),
-            "std": float(success.std()),
-            "ci95": list(wilson_interval(int(success.sum()), success.size)),
-        },
-        "time_steps": _describe(steps),
-        "time_steps_success": _describe(steps[success]) if success.any() else None,
-        "mean_reward": _describe(joined["mean_reward"]),
-        "collisions": _describe(joined["collisions"]),
-        "coverage_m2": _describe(joined["covered_area"]),
-        "success_per_seed": [float(np.mean(np.asarray(s.success))) for s in summaries],
-    }
+
+    def one(key: Array) -> tuple[Array, Observation, EnvState]:
+        start_key, drive_key = jax.random.split(key)
+        start = navigation.reset(jax.random.split(start_key, 1)[0], env_params)
+        step_keys = jax.vmap(lambda k: jax.random.split(jax.random.split(k)[1], 1)[0])(
+            jax.random.split(drive_key, env_params.max_steps)
+        )
+        return step_keys, *start
+
+    return jax.vmap(one, out_axes=(1, 0, 0))(keys)
 
 
-def _describe(values: np.ndarray) -> dict[str, Any]:
-    return {
-        "mean": float(values.mean()),
-        "std": float(values.std()),
-        "ci95": list(bootstrap_interval(values)),
-    }
+@jax.jit
+def step_by_hand(
+    keys: Array, state: EnvState, actions: Array, env_params: EnvParams
+) -> tuple[Observation, EnvState, Array, Array, Array, navigation.Info]:
+    """Advance all robots by actions [E] chosen outside, with the noise of `run_episodes`."""
+    step = jax.vmap(navigation.step, in_axes=(0, 0, 0, None))
+    return step(keys, state, actions, env_params)

@@ -17,20 +17,22 @@ def _quick() -> TrainConfig:
     """Recurrent PQN within the budget of two CPU cores."""
     return TrainConfig(
         method="pqn",
-        total_episodes=76_800,
+        total_episodes=92_160,
         num_envs=256,
         rounds_per_chunk=2,
         env=EnvConfig(near_goal_fraction=0.3),
         network=NetworkConfig(layer_norm=True),
         learner=LearnerConfig(
-            batch_size=32,
-            window_length=50,
+            batch_size=16,
+            window_length=100,
             learning_rate=5e-4,
             learning_rate_schedule="linear",
             discount_start=0.95,
             discount=0.985,
+            average_share=0.05,
+            restart_at_goal=True,
         ),
-        exploration=ExplorationConfig(epsilon_start=0.4, epsilon_end=0.05, ladder=True),
+        exploration=ExplorationConfig(epsilon_start=0.4, epsilon_end=0.02, ladder=True),
     )
 
 
@@ -46,7 +48,13 @@ def _smoke() -> TrainConfig:
         network=NetworkConfig(layer_norm=True),
         replay=ReplayConfig(capacity=64, min_episodes=16),
         learner=LearnerConfig(
-            batch_size=8, learning_rate=1e-3, discount=0.99, window_length=30, burn_in_length=5
+            batch_size=8,
+            learning_rate=1e-3,
+            discount=0.99,
+            window_length=30,
+            burn_in_length=5,
+            average_share=0.1,
+            restart_at_goal=True,
         ),
         exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
         eval=EvalConfig(episodes=8),

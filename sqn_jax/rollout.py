@@ -59,6 +59,24 @@ def start_fleet(key: Array, num_envs: int, network: QNetwork, env_params: EnvPar
     return Fleet(obs=obs, state=state, carry=initial_carry(network.config, num_envs))
 
 
+def restart_at_goal(
+    key: Array, fleet: Fleet, network: QNetwork, env_params: EnvParams
+) -> tuple[Fleet, Array]:
+    """Give every robot that stands within the goal radius a new task; the key is consumed.
+
+    Returns:
+        The fleet, and which robots [N] have begun anew.
+    """
+    away = fleet.state.goal - fleet.state.pose[:, :2]
+    arrived = jnp.hypot(away[:, 0], away[:, 1]) < env_params.goal_radius
+    fresh = start_fleet(key, arrived.shape[0], network, env_params)
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(jnp.expand_dims(arrived, tuple(range(1, old.ndim))), new, old)
+
+    return jax.tree.map(choose, fresh, fleet), arrived
+
+
 def unroll(
     key: Array,
     network: QNetwork,

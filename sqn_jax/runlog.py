@@ -88,14 +88,24 @@ class RunFolder:
         _write_whole(self.path / METRICS, "".join(json.dumps(row) + "\n" for row in kept))
 
     def write_json(self, name: str, data: Mapping[str, Any]) -> None:
-        """Write a JSON file as a whole or not at all."""
-        text = json.dumps(_without_nan(data), indent=2, allow_nan=False)
-        _write_whole(self.path / name, text + "\n")
+        """Write a JSON file of the folder as a whole or not at all."""
+        write_json(self.path / name, data)
 
     def write_records(self, name: str, records: Iterable[Mapping[str, Any]]) -> None:
-        """Write a JSON lines file as a whole or not at all."""
-        lines = [json.dumps(_without_nan(record), allow_nan=False) + "\n" for record in records]
-        _write_whole(self.path / name, "".join(lines))
+        """Write a JSON lines file of the folder as a whole or not at all."""
+        write_records(self.path / name, records)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a JSON file as a whole or not at all; NaN becomes null."""
+    text = json.dumps(_without_nan(data), indent=2, allow_nan=False)
+    _write_whole(path, text + "\n")
+
+
+def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
+    """Write a JSON lines file as a whole or not at all; NaN becomes null."""
+    lines = [json.dumps(_without_nan(record), allow_nan=False) + "\n" for record in records]
+    _write_whole(path, "".join(lines))
 
 
 def _write_whole(path: Path, text: str) -> None:

@@ -5,7 +5,6 @@ The numbers come from `train` and `evaluate`; this module decides what is said a
 
 from __future__ import annotations
 
-import dataclasses
 import signal
 import sys
 import time
@@ -20,11 +19,12 @@ import numpy as np
 from tqdm import tqdm
 
 import sqn_jax
-from sqn_jax import evaluate
 from sqn_jax.checkpoint import Checkpoints
+from sqn_jax.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
+from sqn_jax.policies import Policy, seeds_of
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder
 from sqn_jax.train import (
@@ -33,12 +33,10 @@ from sqn_jax.train import (
     compile_chunk,
     memory_bytes,
     num_windows,
+    policy_params,
     run,
     start_run,
 )
-
-TASKS = {"evaluation points": "evaluation", "random pairs": "training"}
-"""What the final evaluation is done on, and the spawn mode that draws it."""
 
 
 class Stopped(Exception):
@@ -63,16 +61,15 @@ def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -
     """
     occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
-    num_windows(
-        config, env_params
-    )  # Refuses a window that does not fit before anything is written.
+    # Refuses a window that does not fit before anything is written.
+    num_windows(config, env_params)
     folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
     _announce(config, env_params, run_dir)
     with Checkpoints(run_dir) as checkpoints:
         runner, seconds_before = _first_state(config, env_params, folder, checkpoints, resume)
         runner, timing = _train(runner, env_params, config, folder, checkpoints, seconds_before)
-    results = _evaluate(runner, occupancy_map, config, folder)
-    figures = _draw(results, occupancy_map, config, folder)
+    results, drawn = _evaluate(runner, config, folder)
+    figures = _draw(drawn, occupancy_map, config, folder)
     _conclude(results, timing, figures, config, folder)
 
 
@@ -197,84 +194,42 @@ def _signals() -> Iterator[list[int]]:
             signal.signal(each, handler)
 
 
-Results = dict[str, list[tuple[EpisodeSummary, Trace]]]
-"""For each kind of task, one summary and trace a training seed."""
+Drawn = dict[str, tuple[EpisodeSummary, Trace]]
+"""For each kind of task, the episodes of the first seed."""
 
 
 def _evaluate(
-    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
-) -> Results:
+    runner: RunnerState, config: TrainConfig, folder: RunFolder
+) -> tuple[list[dict[str, Any]], Drawn]:
     """Greedy episodes of every seed from the evaluation points and from random pairs."""
-    params = runner.learner.params
-    seeds = [params]
-    if config.num_seeds > 1:
-        seeds = [evaluate.select_seed(params, index) for index in range(config.num_seeds)]
-    results: Results = {}
-    entries: list[dict[str, Any]] = []
-    records: list[dict[str, Any]] = []
-    for number, (tasks, spawn) in enumerate(TASKS.items()):
-        tasks_config = dataclasses.replace(config.env, near_goal_fraction=0.0)
-        env_params = make_env(occupancy_map, tasks_config, spawn=spawn)  # type: ignore[arg-type]
-        key = jax.random.fold_in(jax.random.key(config.eval.seed), number)
-        results[tasks] = [
-            jax.device_get(
-                evaluate.run_episodes(
-                    key,
-                    one,
-                    env_params,
-                    algo=config.algo,
-                    network_config=config.network,
-                    num_episodes=config.eval.episodes,
-                )
-            )
-            for one in seeds
-        ]
-        entries.append(_entry(tasks, results[tasks], config))
-        records += _records(tasks, results[tasks], config)
-    folder.write_json("evaluation.json", {"schema": 1, "results": entries})
+    policy = Policy(
+        folder.path.name, config, seeds_of(policy_params(runner.learner, config), config)
+    )
+    settings = Settings(
+        maps=(config.map,),
+        tasks=("evaluation points", "random pairs"),
+        episodes=config.eval.episodes,
+        eval_seeds=1,
+        seed=config.eval.seed,
+        noise=((config.env.velocity_noise, config.env.range_noise),),
+        goal_radii=(config.env.goal_radius,),
+    )
+    drawn: Drawn = {}
+
+    def keep(_: Agent, world: World, index: int, driven: Driven) -> None:
+        if index == 0:
+            drawn[world.tasks] = (driven[0][0], driven[1])
+
+    evaluation, records = evaluate_agents(
+        [Learnt(config.algo, (policy,))], settings, on_driven=keep
+    )
+    folder.write_json("evaluation.json", evaluation)
     folder.write_records("evaluation.jsonl", records)
-    return results
-
-
-def _entry(
-    tasks: str, results: list[tuple[EpisodeSummary, Trace]], config: TrainConfig
-) -> dict[str, Any]:
-    return {
-        "algorithm": config.algo,
-        "map": config.map,
-        "tasks": tasks,
-        "velocity_noise": config.env.velocity_noise,
-        "range_noise": config.env.range_noise,
-        "goal_radius": config.env.goal_radius,
-        "training_seeds": [config.seed + index for index in range(config.num_seeds)],
-        "episodes": config.eval.episodes,
-        **evaluate.aggregate([summary for summary, _ in results]),
-    }
-
-
-def _records(
-    tasks: str, results: list[tuple[EpisodeSummary, Trace]], config: TrainConfig
-) -> Iterator[dict[str, Any]]:
-    """One object an episode."""
-    for index, (summary, trace) in enumerate(results):
-        for episode in range(config.eval.episodes):
-            yield {
-                "tasks": tasks,
-                "training_seed": config.seed + index,
-                "episode": episode,
-                "start": trace.poses[0, episode].tolist(),
-                "goal": trace.goals[episode].tolist(),
-                "success": bool(summary.success[episode]),
-                "time_steps": int(summary.time_steps[episode]),
-                "mean_reward": float(summary.mean_reward[episode]),
-                "collisions": int(summary.collisions[episode]),
-                "coverage_m2": float(summary.covered_area[episode]),
-                "path_length_m": float(summary.path_length[episode]),
-            }
+    return evaluation["results"], drawn
 
 
 def _draw(
-    results: Results, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+    drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> bool:
     """Write the figures; says so and returns False where Matplotlib is not installed."""
     try:
@@ -285,8 +240,7 @@ def _draw(
     name = f"{config.algo.upper()} on {occupancy_map.name}"
     curve = figures.learning_curve(folder.read_metrics(), title=name)
     figures.save(curve, folder.figures / "learning_curve.png")
-    for tasks, outcomes in results.items():
-        summary, trace = outcomes[0]
+    for tasks, (summary, trace) in drawn.items():
         drawing = figures.trajectories(
             occupancy_map,
             trace.goals,
@@ -303,7 +257,7 @@ def _draw(
 
 
 def _conclude(
-    results: Results,
+    results: list[dict[str, Any]],
     timing: dict[str, float],
     figures: bool,
     config: TrainConfig,
@@ -323,8 +277,8 @@ def _conclude(
         f"trained in {summary['wall_seconds'] / 60:.1f} min "
         f"({summary['steps_per_second']:,} steps a second)"
     )
-    for tasks, outcomes in results.items():
-        entry = evaluate.aggregate([outcome for outcome, _ in outcomes])
+    for entry in results:
+        tasks = entry["tasks"]
         summary[tasks.replace(" ", "_")] = {
             "success": entry["success"]["mean"],
             "time_steps": entry["time_steps"]["mean"],

@@ -1,9 +1,11 @@
-"""Intervals for what an evaluation measured. NumPy and SciPy, on the host."""
+"""Scores and intervals for what an evaluation measured. NumPy and SciPy, on the host."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 
@@ -34,3 +36,75 @@ def bootstrap_interval(
     means = array[rng.integers(array.size, size=(resamples, array.size))].mean(axis=1)
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """Mean of the middle half of all scores, runs and tasks together (Agarwal et al. 2021).
+
+    A quarter of the values, rounded down, is left out at each end; so few that none is, and it is
+    the plain mean.
+    """
+    return float(stats.trim_mean(np.asarray(scores, np.float64).reshape(-1), 0.25))
+
+
+def probability_of_improvement(ours: ArrayLike, theirs: ArrayLike) -> float:
+    """Probability that a run of ours beats a run of theirs; a tie counts one half.
+
+    Args:
+        ours: [K] scores, one a training run, or [K, M] on M tasks, over which it is averaged.
+        theirs: [L] or [L, M].
+    """
+    first, second = (_runs_by_tasks(scores) for scores in (ours, theirs))
+    wins = np.sign(first[:, None] - second[None])
+    return float((0.5 + 0.5 * wins).mean())
+
+
+def stratified_bootstrap(
+    samples: Sequence[ArrayLike],
+    statistic: Callable[..., float],
+    confidence: float = 0.95,
+    resamples: int = 1000,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Percentile interval of a statistic over training runs (Agarwal et al. 2021).
+
+    Runs are drawn with replacement, for each task and each sample on its own.
+
+    Args:
+        samples: one or more arrays [K] or [K, M]: K runs, M tasks.
+        statistic: takes as many arrays [K, M] and returns a number.
+        confidence: of the interval.
+        resamples: how often to draw.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    arrays = [_runs_by_tasks(sample) for sample in samples]
+    values = [
+        statistic(
+            *(np.take_along_axis(x, rng.integers(len(x), size=x.shape), axis=0) for x in arrays)
+        )
+        for _ in range(resamples)
+    ]
+    low, high = np.quantile(values, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def success_weighted_path_length(
+    success: ArrayLike, path_length: ArrayLike, shortest: ArrayLike
+) -> NDArray[np.float64]:
+    """SPL of each episode (Anderson et al. 2018): success x shortest / max(driven, shortest).
+
+    Args:
+        success: [E] bool.
+        path_length: [E] m driven up to the goal.
+        shortest: [E] m, length of the shortest way; a start at the goal (0) counts as 1.
+    """
+    driven, way = np.asarray(path_length, np.float64), np.asarray(shortest, np.float64)
+    longer = np.maximum(driven, way)
+    share = np.divide(way, longer, out=np.ones_like(longer), where=longer > 0)
+    return np.asarray(success, bool) * share
+
+
+def _runs_by_tasks(scores: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(scores, np.float64)
+    return array[:, None] if array.ndim == 1 else array

@@ -6,6 +6,7 @@ in between. Files, bars and pictures stand outside, in whoever consumes the gene
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,11 +24,19 @@ from sqn_jax.agent import pqn, r2d2, replay
 from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, discount_schedule, init_learner, make_optimizer
-from sqn_jax.agent.networks import QNetwork, make_network
+from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.rollout import Fleet, Trace, join_windows, start_fleet, summarize, unroll
+from sqn_jax.rollout import (
+    Fleet,
+    Trace,
+    join_windows,
+    restart_at_goal,
+    start_fleet,
+    summarize,
+    unroll,
+)
 
 
 @struct.dataclass
@@ -47,6 +56,16 @@ class RunnerState:
 def network_of(config: TrainConfig) -> QNetwork:
     """The network a config asks for."""
     return make_network(config.algo, config.network, NUM_ACTIONS)
+
+
+def averages(config: TrainConfig) -> bool:
+    """Whether the policy is an average of the parameters over the last updates."""
+    return config.method == "pqn" and config.learner.average_share > 0
+
+
+def policy_params(learner: LearnerState, config: TrainConfig) -> Params:
+    """The parameters to evaluate and to ship: the averaged ones where there are any."""
+    return learner.target_params if averages(config) else learner.params
 
 
 def num_windows(config: TrainConfig, env_params: EnvParams) -> int:
@@ -111,7 +130,7 @@ def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> Runne
         network,
         optimizer_of(config, env_params),
         jax.tree.map(lambda x: x[None], fleet.obs),
-        use_target=config.method == "r2d2",
+        use_target=config.method == "r2d2" or averages(config),
     )
     memory: ReplayState | None = None
     if config.method == "r2d2":
@@ -137,9 +156,10 @@ def train_round(
         env_params=env_params,
         config=config,
     )
-    first = (runner.learner, runner.memory, fleet)
+    on_first_task = jnp.ones(config.num_envs, bool)
+    first = (runner.learner, runner.memory, fleet, on_first_task)
     keys = jax.random.split(window_key, windows)
-    (learner, memory, _fleet), (traces, learning) = jax.lax.scan(body, first, keys)
+    (learner, memory, *_), (traces, learning) = jax.lax.scan(body, first, keys)
     trace = join_windows(traces)
     summary = summarize(trace, env_params.goal_radius)
     metrics = {
@@ -159,17 +179,21 @@ def train_round(
 
 
 def _drive_and_learn(
-    carry: tuple[LearnerState, Any, Fleet],
+    carry: tuple[LearnerState, Any, Fleet, Array],
     key: Array,
     *,
     epsilon: Array,
     discount: Array | float,
     env_params: EnvParams,
     config: TrainConfig,
-) -> tuple[tuple[LearnerState, Any, Fleet], tuple[Trace, dict[str, Array]]]:
-    """One window: drive it, learn from it."""
-    learner, memory, fleet = carry
-    unroll_key, learn_key = jax.random.split(key)
+) -> tuple[tuple[LearnerState, Any, Fleet, Array], tuple[Trace, dict[str, Array]]]:
+    """One window: drive it, learn from it, and send robots that have arrived to new goals.
+
+    To the learner a new task is a truncation, as the end of every window is one: it has already
+    seen the last observation of the old one. Success and time steps are those of first tasks.
+    """
+    learner, memory, fleet, on_first_task = carry
+    unroll_key, learn_key, restart_key = jax.random.split(key, 3)
     network = network_of(config)
     num_steps = env_params.max_steps // num_windows(config, env_params)
     fleet, episodes, trace = unroll(
@@ -180,7 +204,12 @@ def _drive_and_learn(
     learner, memory, metrics = learn(
         learn_key, learner, memory, episodes, network, optimizer, config, discount
     )
-    return (learner, memory, fleet), (trace, metrics)
+    distances = jnp.where(on_first_task[None], trace.goal_distances, jnp.inf)
+    trace = dataclasses.replace(trace, goal_distances=distances)
+    if config.method == "pqn" and config.learner.restart_at_goal:
+        fleet, restarted = restart_at_goal(restart_key, fleet, network, env_params)
+        on_first_task &= ~restarted
+    return (learner, memory, fleet, on_first_task), (trace, metrics)
 
 
 def train_chunk(

@@ -11,6 +11,9 @@ os.environ["JAX_ENABLE_X64"] = "0"
 import hypothesis
 import jax
 
+# One computation at a time: several in flight would wait for each other's threads on two cores.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+
 # [T] + [N, T] broadcasts to something that looks right and is not: make every such case spell
 # out what it means.
 jax.config.update("jax_numpy_rank_promotion", "raise")

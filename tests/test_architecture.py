@@ -22,14 +22,19 @@ MAX_FUNCTION_LINES = 80
 # room is entered here, on its layer.
 RUN_LAYER = {
     "adapters",
+    "bug",
     "checkpoint",
+    "compare",
     "evaluate",
     "export",
     "figures",
+    "navigators",
     "planners",
+    "policies",
     "render",
     "report",
     "runlog",
+    "scores",
     "statistics",
     "train",
 }
@@ -46,7 +51,7 @@ ARROWS: dict[str, set[str]] = {
     "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
     "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
     "__main__": {"cli"},
-    "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
+    "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
     "notebooks": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
 }
 # env meets maps in one module: the one that makes EnvParams.

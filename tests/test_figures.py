@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle
 from PIL import Image
 
-from sqn_jax import figures
+from sqn_jax.figures import runs as figures
 from sqn_jax.maps import OccupancyMap
 
 FULL_DPI = figures.DPI

@@ -15,9 +15,17 @@ from scipy import stats
 
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.config import EnvConfig, NetworkConfig
-from sqn_jax.env import EnvParams, make_env, step
+from sqn_jax.env import EnvParams, make_env, step, true_ranges
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.rollout import Fleet, Trace, join_windows, start_fleet, summarize, unroll
+from sqn_jax.rollout import (
+    Fleet,
+    Trace,
+    join_windows,
+    restart_at_goal,
+    start_fleet,
+    summarize,
+    unroll,
+)
 
 LENGTH, ROBOTS, ACTIONS = 14, 3, 5
 NETWORK = make_network("sqn", NetworkConfig(hidden_size=8), ACTIONS)
@@ -268,3 +276,34 @@ def test_summaries_are_those_counted_in_a_loop() -> None:
         )
     # Among them: reached with the first step, with the last, in between, and not at all.
     assert {1, length, None} <= set(first_entries)
+
+
+def test_robots_at_their_goal_begin_anew_and_the_others_go_on(room: EnvParams) -> None:
+    fleet = start(jax.random.key(21), 40, NETWORK, room)
+    rng = np.random.default_rng(22)
+    away = rng.uniform(0.0, 0.6, 40) * np.where(rng.random(40) < 0.5, 1, -1)
+    goals = np.asarray(fleet.state.pose[:, :2]) + np.stack([away, np.zeros(40)], axis=1)
+    state = dataclasses.replace(
+        fleet.state, goal=jnp.asarray(goals, jnp.float32), step=jnp.full(40, 9)
+    )
+    carry = jnp.asarray(rng.normal(size=fleet.carry.shape), jnp.float32)
+    driven = dataclasses.replace(fleet, state=state, carry=carry)
+    after, restarted = jax.jit(restart_at_goal, static_argnames="network")(
+        jax.random.key(23), driven, NETWORK, room
+    )
+    expected = np.abs(away) < 0.3
+    assert 5 < expected.sum() < 35
+    np.testing.assert_array_equal(restarted, expected)
+    for new, old in zip(jax.tree.leaves(after), jax.tree.leaves(driven), strict=True):
+        np.testing.assert_array_equal(np.asarray(new)[~expected], np.asarray(old)[~expected])
+    assert (np.asarray(after.state.step)[expected] == 0).all()
+    assert (np.asarray(after.carry)[expected] == 0).all()
+    headings = np.asarray(after.state.pose)[expected, 2]
+    assert (headings != np.asarray(driven.state.pose)[expected, 2]).all()
+    assert len(np.unique(headings)) == len(headings), "each begins in its own way"
+    # What they see is what is seen from where they are now.
+    seen = jax.vmap(lambda pose: true_ranges(pose, room))(after.state.pose)
+    limit = room.config.max_range
+    np.testing.assert_allclose(
+        np.asarray(after.obs.ranges)[expected], np.asarray(seen)[expected] / limit, atol=1e-5
+    )

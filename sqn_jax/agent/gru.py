@@ -63,30 +63,35 @@ def scan_gru(projected: Array, carry: Array, hidden_kernel: Array, candidate_bia
     return _forward(projected, carry, hidden_kernel, candidate_bias)[0]
 
 
-def _gates(
-    projected: Array, hidden: Array, hidden_kernel: Array, candidate_bias: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Reset gate, update gate, candidate and its recurrent part, each [B, H]."""
-    recurrent = hidden @ hidden_kernel
-    input_reset, input_update, input_candidate = jnp.split(projected, 3, axis=-1)
-    recurrent_reset, recurrent_update, recurrent_candidate = jnp.split(recurrent, 3, axis=-1)
-    recurrent_candidate = recurrent_candidate + jnp.expand_dims(candidate_bias, 0)
-    reset = jax.nn.sigmoid(input_reset + recurrent_reset)
-    update = jax.nn.sigmoid(input_update + recurrent_update)
-    candidate = jnp.tanh(input_candidate + reset * recurrent_candidate)
-    return reset, update, candidate, recurrent_candidate
+def _by_gate(array: Array) -> tuple[Array, Array, Array]:
+    """Split [..., 3 H] into the three gates.
+
+    Inside a loop the gates stay apart: XLA's CPU code for a slice of a [B, 3 H] array, fused with
+    what follows, is scalar and takes twice the time of all the rest.
+    """
+    reset, update, candidate = jnp.split(array, 3, axis=-1)
+    return reset, update, candidate
 
 
 def _forward(
     projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array
 ) -> tuple[Array, tuple[Array, ...]]:
-    def advance(hidden: Array, inputs: Array) -> tuple[Array, tuple[Array, ...]]:
-        reset, update, candidate, recurrent = _gates(inputs, hidden, hidden_kernel, candidate_bias)
+    reset_kernel, update_kernel, candidate_kernel = _by_gate(hidden_kernel)
+    bias = jnp.expand_dims(candidate_bias, 0)
+
+    def advance(
+        hidden: Array, inputs: tuple[Array, Array, Array]
+    ) -> tuple[Array, tuple[Array, ...]]:
+        to_reset, to_update, to_candidate = inputs
+        recurrent = hidden @ candidate_kernel + bias
+        reset = jax.nn.sigmoid(to_reset + hidden @ reset_kernel)
+        update = jax.nn.sigmoid(to_update + hidden @ update_kernel)
+        candidate = jnp.tanh(to_candidate + reset * recurrent)
         new_hidden = (1 - update) * candidate + update * hidden
         return new_hidden, (new_hidden, reset, update, candidate, recurrent)
 
-    _, (hidden, reset, update, candidate, recurrent) = jax.lax.scan(advance, carry, projected)
-    return hidden, (hidden, carry, hidden_kernel, reset, update, candidate, recurrent)
+    _, (hidden, *gates) = jax.lax.scan(advance, carry, _by_gate(projected))
+    return hidden, (hidden, carry, hidden_kernel, *gates)
 
 
 def _backward(

@@ -24,7 +24,7 @@ class LearnerState:
     params: Params
     """Online parameters."""
     target_params: Params
-    """Slowly following copy; None for a method without one."""
+    """Slowly following copy: r2d2 learns towards it, pqn only hands it out. None without one."""
     opt_state: Any
     """Adam's moments and counter."""
     num_updates: Array
@@ -101,6 +101,18 @@ def gradient_step(
         "skill_distance": output.skill_distance,
     }
     return new_state, output, metrics
+
+
+def average_params(state: LearnerState, share: float) -> LearnerState:
+    """Let the copy follow as the average over about the last `share` of all updates.
+
+    Polynomial-decay averaging: update t moves it by 1 / (1 + share t), so that the average covers
+    the same share however long the run is. The latest parameters of fresh-data Q-learning swing
+    from update to update; their average is the better greedy policy by far.
+    """
+    step = 1.0 / (1.0 + share * (state.num_updates - 1))
+    average = jax.tree.map(lambda a, x: a + step * (x - a), state.target_params, state.params)
+    return dataclasses.replace(state, target_params=average)
 
 
 def update_target(state: LearnerState, rate: float) -> LearnerState:

@@ -17,7 +17,7 @@ import optax
 from jax import Array
 
 from sqn_jax.agent.experience import Episodes
-from sqn_jax.agent.learner import LearnerState, gradient_step
+from sqn_jax.agent.learner import LearnerState, average_params, gradient_step
 from sqn_jax.agent.loss import pqn_loss
 from sqn_jax.agent.networks import QNetwork
 from sqn_jax.config import TrainConfig
@@ -82,4 +82,6 @@ def _update(
         return pqn_loss(params, network, episodes, config.learner, discount)
 
     state, _, metrics = gradient_step(state, optimizer, loss_function)
+    if state.target_params is not None:
+        state = average_params(state, config.learner.average_share)
     return state, metrics

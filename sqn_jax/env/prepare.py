@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
@@ -66,8 +68,6 @@ def make_env(
         occupancy_map = load_map(name, robot_radius=config.robot_radius)
     body_free = traversable(occupancy_map.occupied, occupancy_map.resolution, config.robot_radius)
     positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
-    speed = np.array([config.forward_speed, config.turn_rate], np.float32)
-    noise_unit = speed if config.velocity_noise_unit == "relative" else np.ones(2, np.float32)
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
     height_m, width_m = np.array(occupancy_map.occupied.shape) * occupancy_map.resolution
     return EnvParams(
@@ -91,7 +91,7 @@ def make_env(
         ),
         time_step=jnp.float32(config.time_step),
         goal_radius=jnp.float32(config.goal_radius),
-        velocity_noise=jnp.asarray(config.velocity_noise * noise_unit, jnp.float32),
+        velocity_noise=_velocity_noise(config),
         range_noise=jnp.float32(config.range_noise),
         reward_weights=jnp.array(
             [config.reward_navigation, config.reward_exploration, config.reward_time], jnp.float32
@@ -100,6 +100,39 @@ def make_env(
         max_steps=config.max_steps or occupancy_map.max_steps,
         coverage_shape=coverage.grid_shape(height_m, width_m, config.coverage_cell),
     )
+
+
+def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> EnvParams:
+    """The same world under other noise, in the units its config names.
+
+    The levels are traced: all levels above 0 share one compiled program.
+
+    Args:
+        params: from `make_env`.
+        velocity_noise: as `EnvConfig.velocity_noise`.
+        range_noise: as `EnvConfig.range_noise`.
+
+    Raises:
+        ValueError: a level is negative or not finite.
+    """
+    given = dataclasses.replace(
+        params.config, velocity_noise=velocity_noise, range_noise=range_noise
+    )
+    compiled_in = dataclasses.replace(
+        given, velocity_noise=float(velocity_noise > 0), range_noise=float(range_noise > 0)
+    )
+    return dataclasses.replace(
+        params,
+        velocity_noise=_velocity_noise(given),
+        range_noise=jnp.float32(range_noise),
+        config=compiled_in,
+    )
+
+
+def _velocity_noise(config: EnvConfig) -> Array:
+    speed = np.array([config.forward_speed, config.turn_rate], np.float32)
+    unit = speed if config.velocity_noise_unit == "relative" else np.ones(2, np.float32)
+    return jnp.asarray(config.velocity_noise * unit, jnp.float32)
 
 
 def _ray_grid(

@@ -137,6 +137,38 @@ def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
     np.testing.assert_allclose(metrics["gradient_norm"], np.mean(adam.norms), rtol=1e-4)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_pqn_hands_out_the_average_of_its_latest_parameters(share: float) -> None:
+    config = config_for("pqn", learner={"num_passes": 2, "average_share": share})
+    state = fresh_state(config, 34, use_target=True)
+    episodes = random_episodes(np.random.default_rng(35), LENGTH, 6)
+    learn = learn_with(pqn, config)
+    averaged = learn(jax.random.key(0), state, None, episodes)[0]
+    # The average must not steer the learning; without it the same parameters come out.
+    plain = dataclasses.replace(state, target_params=None)
+    alone = learn_with(pqn, config_for("pqn", learner={"num_passes": 2}))
+    assert_same_params(
+        averaged.params, alone(jax.random.key(0), plain, None, episodes)[0].params, 0.01
+    )
+    slope = jax.jit(
+        jax.grad(lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0])
+    )
+    adam = HandMadeAdam(config, state.params)
+    history = []
+    for first in (0, 1, 2, 0, 1, 2):
+        adam.update(slope(adam.params, of_robots(episodes, np.array([first, first + 3]))))
+        history.append(jax.tree.map(np.asarray, adam.params))
+    # Weight of each update in closed form: with a share of 1 all count alike, with less the latest
+    # more. Update t enters with 1 / (1 + share (t - 1)) and is thinned by all that come after.
+    steps = np.array([1 / (1 + share * t) for t in range(6)])
+    weights = [steps[t] * np.prod(1 - steps[t + 1 :]) for t in range(6)]
+    assert sum(weights) == pytest.approx(1)
+    if share == 1:
+        np.testing.assert_allclose(weights, 1 / 6)
+    by_hand = jax.tree.map(lambda *x: sum(w * y for w, y in zip(weights, x, strict=True)), *history)
+    assert_same_params(averaged.target_params, by_hand, 0.01)
+
+
 @pytest.mark.parametrize(("num_passes", "batch_size"), [(1, 2), (2, 3), (1, 6), (1, 1)])
 def test_pqn_sees_every_episode_equally_often(
     monkeypatch: pytest.MonkeyPatch, num_passes: int, batch_size: int

@@ -1,8 +1,4 @@
-"""Pictures of recorded data: how training went, and which paths the robot took.
-
-Every function takes NumPy data (or rows of a run's `metrics.jsonl`) and returns a Matplotlib
-`Figure` that belongs to nobody: no pyplot, no display, no global state. `save` writes one as PNG.
-"""
+"""How one run went: its learning curve, and the paths its robot took."""
 
 from __future__ import annotations
 
@@ -35,7 +31,7 @@ WIDTH_IN = 9.0
 MAX_PATHS = 8  # in one panel; more would hide each other
 
 # Okabe and Ito's colours, told apart under every common colour blindness; no yellow on white.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _OBSTACLE, _UNREACHABLE, _INK, _RED, _YELLOW = "#333a42", "#b9b9b9", "#222222", "#b00020", "#ffd92f"
 _GROUND_MAP = ListedColormap([_UNREACHABLE, _OBSTACLE])
 # Few and light shades, so that their steps read as height lines and paths stand out.
@@ -92,7 +88,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     lines, columns = (2, 2) if skills > 1 else (1, 3)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
     panels[0].set_title("mean reward a step", fontsize=11)
-    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), _COLOURS[0])
+    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLOURS[0])
     _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
     _draw_loss(panels[2], episodes, _metric(rows, "loss"))
     if skills > 1:
@@ -118,7 +114,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
 def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
     """Success, with the share of random actions that it suffers from."""
     axes.set_title("success under exploration noise", fontsize=11)
-    _draw_curve(axes, episodes, success, _COLOURS[2], "success")
+    _draw_curve(axes, episodes, success, COLOURS[2], "success")
     if np.isfinite(epsilon).any():
         _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
     _finish_shares(axes)
@@ -126,7 +122,7 @@ def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats
 
 def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
     axes.set_title("loss", fontsize=11)
-    _draw_curve(axes, episodes, loss, _COLOURS[1])
+    _draw_curve(axes, episodes, loss, COLOURS[1])
     if not np.isfinite(loss).any():
         axes.text(0.5, 0.5, "no update yet", transform=axes.transAxes, ha="center", color="0.4")
         axes.set_yticks([])
@@ -139,7 +135,7 @@ def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -
     axes.set_title("weight of the skills", fontsize=11)
     skills = usage.shape[2]
     for skill in range(skills):
-        colour = _COLOURS[skill % len(_COLOURS)]
+        colour = COLOURS[skill % len(COLOURS)]
         _draw_curve(axes, episodes, usage[..., skill], colour, f"skill {skill + 1}")
     if np.isfinite(entropy).any():
         share = entropy / math.log(skills)
@@ -344,7 +340,7 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
     width, order = (2.0, 3) if reached else (1.4, 2)
     lines = LineCollection(segments, linewidths=width, capstyle="round", zorder=order)
     if weights is None:
-        lines.set_color(_COLOURS[0])
+        lines.set_color(COLOURS[0])
     else:
         lines.set(array=weights, cmap=_WEIGHT_MAP, norm=Normalize(0.0, 1.0))
     axes.add_collection(lines, autolim=False)

@@ -1,0 +1,103 @@
+"""What the experiments share: options, and training what is missing."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sqn_jax.compare import Agent, Settings, evaluate_agents, num_episodes
+from sqn_jax.config import Algorithm, TrainConfig
+from sqn_jax.presets import PRESETS
+from sqn_jax.runlog import RunFolder, write_json, write_records
+from sqn_jax.session import Stopped, train_session
+
+ALGORITHMS: tuple[Algorithm, ...] = ("sqn", "r2d2", "dqn")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options that every experiment has."""
+    parser.add_argument("--preset", choices=list(PRESETS), default="quick")
+    parser.add_argument("--algos", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    parser.add_argument("--num-seeds", type=int, default=1, help="training seeds (default 1)")
+    parser.add_argument("--total-episodes", type=int, help="instead of the preset's")
+    parser.add_argument("--episodes", type=int, default=100, help="under each evaluation seed")
+    parser.add_argument("--eval-seeds", type=int, default=5)
+    parser.add_argument("--runs", type=Path, help="where runs are kept (default runs/PRESET)")
+    parser.add_argument("--out", type=Path, help="results folder (default the runs' folder)")
+
+
+def runs_folder(options: argparse.Namespace) -> Path:
+    """Where the runs of these options are kept."""
+    return options.runs or Path("runs") / f"table_{options.preset}"
+
+
+def train_missing(options: argparse.Namespace) -> list[Path]:
+    """Train every agent and seed of which there is no finished run; returns all run folders.
+
+    Seeds are trained one after the other: a run that was stopped is gone on with, and a seed added
+    later does not train the others again.
+
+    Raises:
+        ValueError: a folder holds a run with other settings.
+    """
+    folders = []
+    for algo in options.algos:
+        for seed in range(options.num_seeds):
+            changes: dict[str, Any] = {"algo": algo, "seed": seed}
+            if options.total_episodes is not None:
+                changes["total_episodes"] = options.total_episodes
+            config = dataclasses.replace(PRESETS[options.preset], **changes)
+            folder = runs_folder(options) / f"{algo}_seed{seed}"
+            _train(config, folder)
+            folders.append(folder)
+    return folders
+
+
+def _train(config: TrainConfig, folder: Path) -> None:
+    begun = (folder / "config.json").is_file()
+    if begun and RunFolder.open(folder)[1] != config:
+        raise ValueError(
+            f"run folder {folder}: holds a run with other settings, expected --runs to name a "
+            "folder for these"
+        )
+    if (folder / "summary.json").is_file():
+        print(f"{folder} is trained")
+        return
+    # A run that was killed before its first checkpoint is begun anew.
+    has_checkpoint = begun and any((folder / "checkpoints").glob("[0-9]*"))
+    if begun and not has_checkpoint:
+        (folder / "config.json").unlink()
+        (folder / "metrics.jsonl").unlink(missing_ok=True)
+    train_session(config, folder, resume=has_checkpoint)
+
+
+def evaluate_and_write(agents: list[Agent], settings: Settings, path: Path) -> dict[str, Any]:
+    """Evaluate with a progress bar; writes the evaluation and, beside it, one record an episode."""
+    with tqdm(
+        total=num_episodes(agents, settings),
+        unit=" episodes",
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        dynamic_ncols=True,
+    ) as bar:
+        evaluation, records = evaluate_agents(agents, settings, bar.update)
+    write_json(path, evaluation)
+    write_records(path.with_suffix(".jsonl"), records)
+    return evaluation
+
+
+def run(main: Any) -> None:
+    """Call an experiment's main; unusable input is one line and exit code 2."""
+    try:
+        main()
+    except (ValueError, OSError, json.JSONDecodeError) as error:
+        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except Stopped as stop:
+        print("saved; the same command goes on from here", file=sys.stderr)
+        raise SystemExit(stop.exit_code) from None

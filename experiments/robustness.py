@@ -1,0 +1,60 @@
+"""The paper's robustness figure: success under velocity noise and range noise.
+
+    python experiments/robustness.py [--preset quick|paper|smoke] [--num-seeds K] [--map maze]
+
+Uses the runs of table1.py, trains what is missing, and writes robustness.json (with one record an
+episode in robustness.jsonl), robustness.md and robustness.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from experiments.common import add_options, evaluate_and_write, run, runs_folder, train_missing
+from sqn_jax import figures
+from sqn_jax.compare import Settings, group_policies
+from sqn_jax.policies import load_policy
+from sqn_jax.scores import results_table
+
+VELOCITY_NOISE = (0.1, 0.2, 0.3)
+RANGE_NOISE = (0.2, 0.4, 0.6)
+
+
+def main() -> None:
+    """Parse the options, train, evaluate, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    add_options(parser)
+    parser.add_argument("--map", default="maze")
+    parser.add_argument("--noise-unit", choices=["relative", "absolute"], default="relative")
+    options = parser.parse_args()
+    settings = Settings(
+        maps=(options.map,),
+        episodes=options.episodes,
+        eval_seeds=options.eval_seeds,
+        noise=(
+            (0.0, 0.0),
+            *((level, 0.0) for level in VELOCITY_NOISE),
+            *((0.0, level) for level in RANGE_NOISE),
+        ),
+        noise_unit=options.noise_unit,
+    )
+    folders = train_missing(options)
+    out: Path = options.out or runs_folder(options)
+    out.mkdir(parents=True, exist_ok=True)
+    agents = group_policies([load_policy(folder) for folder in folders])
+    evaluation = evaluate_and_write(list(agents), settings, out / "robustness.json")
+    radius = settings.goal_radii[0]
+    shown = [entry for entry in evaluation["results"] if entry["goal_radius"] == radius]
+    figure = figures.robustness(
+        shown, title=f"Robustness on {options.map}, goal radius {radius:g} m"
+    )
+    figures.save(figure, out / "robustness.png")
+    table = results_table(evaluation["results"])
+    (out / "robustness.md").write_text(f"# Robustness\n\n{table}\n", encoding="utf-8")
+    print(table)
+    print(f"wrote robustness.json, robustness.jsonl, robustness.md and robustness.png to {out}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,115 @@
+"""The paper's table: three agents on four maps, beside the paper's numbers and two references.
+
+    python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
+
+Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
+table1.jsonl), table1.md and learning_curves.png. About 12 minutes a quick run, a minute in all for
+smoke, and the full thing for paper.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from experiments.common import add_options, evaluate_and_write, run, runs_folder, train_missing
+from sqn_jax import figures
+from sqn_jax.compare import Settings, group_policies, with_references
+from sqn_jax.policies import load_policy
+from sqn_jax.runlog import RunFolder
+from sqn_jax.scores import markdown_table, results_table
+
+PAPER = {
+    "dqn": {"maze": (0.72, 253.0), "column": (0.95, 151.5), "forest": (0.97, 167.0)},
+    "r2d2": {"maze": (0.70, 257.8), "column": (0.99, 172.4), "forest": (0.91, 221.8)},
+    "sqn": {"maze": (0.98, 181.1), "column": (0.99, 148.7), "forest": (0.93, 171.4)},
+}
+"""Success and time steps, table I of the paper; its maps are not published, ours are others."""
+PAPER_CAVE = {"dqn": (0.38, 1061.4), "r2d2": (0.64, 937.7), "sqn": (0.82, 767.5)}
+
+
+def paper_table(results: list[dict[str, Any]]) -> str:
+    """Success and time steps of each agent on each map, ours and the paper's."""
+    radius = results[0]["goal_radius"]
+    maps = list(dict.fromkeys(entry["map"] for entry in results))
+    agents = list(dict.fromkeys(entry["agent"] for entry in results))
+    rows = []
+    for agent in agents:
+        row = [agent]
+        for name in maps:
+            (entry,) = (
+                entry
+                for entry in results
+                if (entry["agent"], entry["map"], entry["goal_radius"]) == (agent, name, radius)
+            )
+            told = f"{_spread(entry['success'], 2)}, {_spread(entry['time_steps'], 1)}"
+            theirs = PAPER.get(entry["algorithm"], {}).get(name)
+            if name == "cave":
+                theirs = PAPER_CAVE.get(entry["algorithm"])
+            if theirs:
+                told += f" (paper {theirs[0]:.2f}, {theirs[1]:.1f})"
+            row.append(told)
+        rows.append(row)
+    return markdown_table(["agent: success, time steps", *maps], rows)
+
+
+def _spread(told: dict[str, Any], digits: int) -> str:
+    return f"{told['mean']:.{digits}f} ± {told['std_of_means']:.{digits}f}"
+
+
+def report(evaluation: dict[str, Any], settings: Settings) -> str:
+    """The page table1.md."""
+    results = evaluation["results"]
+    seeds = len(results[0]["training_seeds"])
+    lines = [
+        "# Table I",
+        "",
+        f"Greedy episodes between the maps' evaluation points, {settings.episodes} under each of "
+        f"{settings.eval_seeds} evaluation seeds, {seeds} training seed(s); goal radius "
+        f"{settings.goal_radii[0]:g} m, failures at the step limit. ± is the spread of the means "
+        "of the seeds.",
+        "",
+        paper_table(results),
+        "",
+        results_table(results),
+    ]
+    for told in evaluation["comparisons"]:
+        low, high = told["ci95"]
+        lines += [
+            "",
+            f"A training run of {told['first']} has more success than one of {told['second']} with "
+            f"probability {told['probability']:.2f} [{low:.2f}, {high:.2f}].",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Parse the options, train, evaluate, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    add_options(parser)
+    parser.add_argument("--maps", nargs="+", default=["maze", "column", "forest", "cave"])
+    options = parser.parse_args()
+    settings = Settings(
+        maps=tuple(options.maps), episodes=options.episodes, eval_seeds=options.eval_seeds
+    )
+    folders = train_missing(options)
+    out: Path = options.out or runs_folder(options)
+    out.mkdir(parents=True, exist_ok=True)
+    curves: dict[str, list[Any]] = {}
+    for folder in folders:
+        run_folder, config = RunFolder.open(folder)
+        curves.setdefault(config.algo.upper(), []).append(run_folder.read_metrics())
+    figure = figures.learning_curves(curves, title=f"Training, preset {options.preset}")
+    figures.save(figure, out / "learning_curves.png")
+    learnt = group_policies([load_policy(folder) for folder in folders])
+    agents = with_references(learnt, references=True)
+    evaluation = evaluate_and_write(agents, settings, out / "table1.json")
+    page = report(evaluation, settings)
+    (out / "table1.md").write_text(page, encoding="utf-8")
+    print(page)
+    print(f"wrote table1.json, table1.jsonl, table1.md and learning_curves.png to {out}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,353 @@
+"""Agents side by side: the same starts, goals and noise for each, on any maps.
+
+`evaluate_agents` drives learnt policies and reference navigators over maps and noise levels and
+returns what the evaluation file holds. What is said on screen is up to the caller.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from sqn_jax import evaluate, navigators, scores
+from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.env import EnvParams, make_env
+from sqn_jax.env.prepare import with_noise
+from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
+from sqn_jax.policies import Policy
+from sqn_jax.rollout import EpisodeSummary, Trace, summarize
+from sqn_jax.scores import Outcome
+
+Tasks = Literal["evaluation points", "random pairs"]
+SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
+    "evaluation points": "evaluation",
+    "random pairs": "training",
+}
+"""The two kinds of tasks, and the spawn mode that draws them."""
+
+FIELD_CELLS = 4_000_000
+"""Cells of goal-distance fields that are held at a time."""
+
+Driven = tuple[list[EpisodeSummary], Trace]
+"""A summary for each goal radius, and the trace."""
+OnBatch = Callable[[int], object]
+OnDriven = Callable[["Agent", "World", int, Driven], object]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an evaluation is made of."""
+
+    maps: tuple[str, ...]
+    """Maps of the project by name, or files."""
+    tasks: tuple[Tasks, ...] = ("evaluation points",)
+    episodes: int = 100
+    """Episodes under each evaluation seed."""
+    eval_seeds: int = 5
+    """How many evaluation seeds."""
+    seed: int = 1_000
+    """The first of them."""
+    noise: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    """Pairs of velocity noise and range noise."""
+    noise_unit: Literal["relative", "absolute"] | None = None
+    """Reading of both, see `EnvConfig`; None as each robot was configured."""
+    goal_radii: tuple[float, ...] = (0.3, 0.5)
+    """m; each radius is judged from the same episodes."""
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "eval_seeds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed is {self.seed}, expected a number from 0 to 2147483647")
+        for level in (level for pair in self.noise for level in pair):
+            if not 0 <= level < float("inf"):
+                raise ValueError(f"noise is {level}, expected 0 or a positive number")
+        for radius in self.goal_radii:
+            if not 0 < radius < float("inf"):
+                raise ValueError(f"goal radius is {radius}, expected a positive number")
+        if not (self.maps and self.tasks and self.noise and self.goal_radii):
+            raise ValueError("nothing to evaluate: expected a map, a task and a goal radius")
+
+
+class Agent(Protocol):
+    """Whoever drives."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def algorithm(self) -> str: ...
+    @property
+    def env_config(self) -> EnvConfig:
+        """The robot and its sensors."""
+
+    @property
+    def training_seeds(self) -> Sequence[int | None]:
+        """One None for an agent that was not trained."""
+
+    def drive(
+        self, index: int, world: World, eval_seed: int, settings: Settings, on_batch: OnBatch
+    ) -> Driven:
+        """Episodes of the training seed with this index: a summary for each goal radius."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A map made ready for a robot, some tasks and some noise."""
+
+    occupancy_map: OccupancyMap
+    env_params: EnvParams
+    tasks: Tasks
+    noise: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Policies of one agent: runs that differ in nothing but their seeds."""
+
+    name: str
+    policies: tuple[Policy, ...]
+
+    @property
+    def algorithm(self) -> str:
+        return self.policies[0].config.algo
+
+    @property
+    def env_config(self) -> EnvConfig:
+        return self.policies[0].config.env
+
+    @property
+    def training_seeds(self) -> Sequence[int | None]:
+        return [seed for policy in self.policies for seed in policy.training_seeds]
+
+    def drive(
+        self, index: int, world: World, eval_seed: int, settings: Settings, on_batch: OnBatch
+    ) -> Driven:
+        params = [params for policy in self.policies for params in policy.params]
+        config = self.policies[0].config
+        return evaluate.run_episodes(
+            evaluate.episode_keys(task_key(eval_seed, world.tasks), settings.episodes),
+            params[index],
+            world.env_params,
+            algo=config.algo,
+            network_config=config.network,
+            goal_radii=settings.goal_radii,
+            on_batch=on_batch,
+        )
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A navigator that was not trained: `oracle` knows the map, `bug` sees what the agents see."""
+
+    name: Literal["oracle", "bug"]
+    env_config: EnvConfig
+    training_seeds: Sequence[int | None] = (None,)
+
+    @property
+    def algorithm(self) -> str:
+        return self.name
+
+    def drive(
+        self, index: int, world: World, eval_seed: int, settings: Settings, on_batch: OnBatch
+    ) -> Driven:
+        del index
+        key, count, env_params = (
+            task_key(eval_seed, world.tasks),
+            settings.episodes,
+            world.env_params,
+        )
+        if self.name == "oracle":
+            _, trace = navigators.run_oracle(key, world.occupancy_map, env_params, count)
+        else:
+            _, trace = navigators.run_bug(key, env_params, count)
+        on_batch(count)
+        return [jax.device_get(summarize(trace, radius)) for radius in settings.goal_radii], trace
+
+
+def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
+    """Pool the runs that differ in nothing but their seeds; each pool is one agent.
+
+    Raises:
+        ValueError: a training seed comes twice in a pool.
+    """
+    pools: dict[TrainConfig, list[Policy]] = {}
+    for policy in policies:
+        same = dataclasses.replace(policy.config, seed=0, num_seeds=1, checkpoint_minutes=1.0)
+        pools.setdefault(same, []).append(policy)
+    algorithms = [config.algo for config in pools]
+    agents = []
+    for config, pool in pools.items():
+        alone = algorithms.count(config.algo) == 1
+        agent = Learnt(config.algo if alone else f"{config.algo} {pool[0].name}", tuple(pool))
+        seeds = list(agent.training_seeds)
+        if len(set(seeds)) < len(seeds):
+            folders = ", ".join(policy.name for policy in pool)
+            raise ValueError(f"runs {folders}: the same settings and the same training seed twice")
+        agents.append(agent)
+    return agents
+
+
+def with_references(agents: Sequence[Agent], *, references: bool) -> list[Agent]:
+    """The agents, and after them the navigators that were not trained, with the first's robot."""
+    if not references:
+        return list(agents)
+    robot = agents[0].env_config if agents else EnvConfig()
+    return [*agents, Reference("bug", robot), Reference("oracle", robot)]
+
+
+def num_episodes(agents: Sequence[Agent], settings: Settings) -> int:
+    """Episodes that `evaluate_agents` will drive."""
+    worlds = len(settings.maps) * len(settings.tasks) * len(settings.noise)
+    policies = sum(len(agent.training_seeds) for agent in agents)
+    return worlds * policies * settings.eval_seeds * settings.episodes
+
+
+def evaluate_agents(
+    agents: Sequence[Agent],
+    settings: Settings,
+    on_batch: OnBatch = lambda count: None,
+    on_driven: OnDriven = lambda agent, world, index, driven: None,
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Drive every agent in every world.
+
+    Args:
+        agents: who drives; names must differ.
+        settings: where, how often and under what noise.
+        on_batch: called with the number of episodes just driven.
+        on_driven: called with agent, world, index of the training seed and what was driven, for
+            those who want the traces.
+
+    Returns:
+        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode.
+
+    Raises:
+        ValueError: a map is unusable for a robot.
+    """
+    results, records = [], []
+    quiet: dict[str, list[list[Outcome]]] = {agent.name: [] for agent in agents}
+    robots = {agent.name: _robot(agent.env_config, settings) for agent in agents}
+    for robot in dict.fromkeys(robots.values()):
+        ways: dict[bytes, NDArray[np.float64]] = {}
+        for world in _worlds(robot, settings):
+            for agent in (agent for agent in agents if robots[agent.name] == robot):
+                outcomes = _outcomes(agent, world, settings, ways, on_batch, on_driven)
+                for radius, of_radius in outcomes.items():
+                    labels = _labels(agent, world, radius)
+                    results.append({**labels, **_entry(agent, settings, of_radius)})
+                    records += scores.records(of_radius, **labels)
+                if world.noise == (0.0, 0.0):
+                    quiet[agent.name].append(outcomes[settings.goal_radii[0]])
+    comparisons = [
+        {"first": first, "second": second, **told}
+        for first in quiet
+        for second in quiet
+        if first != second and (told := scores.improvement(quiet[first], quiet[second]))
+    ]
+    return {"schema": 1, "results": results, "comparisons": comparisons}, records
+
+
+def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
+    """The robot and its sensors, without what belongs to training or comes from the settings."""
+    units = {}
+    if settings.noise_unit is not None:
+        units = {
+            "velocity_noise_unit": settings.noise_unit,
+            "range_noise_unit": settings.noise_unit,
+        }
+    return dataclasses.replace(
+        env_config, near_goal_fraction=0.0, velocity_noise=0.0, range_noise=0.0, **units
+    )
+
+
+def _worlds(robot: EnvConfig, settings: Settings) -> Iterator[World]:
+    for name in settings.maps:
+        occupancy_map = load_map(name, robot_radius=robot.robot_radius)
+        for tasks in settings.tasks:
+            quiet = make_env(occupancy_map, robot, spawn=SPAWN_MODES[tasks])
+            for noise in settings.noise:
+                yield World(occupancy_map, with_noise(quiet, *noise), tasks, noise)
+
+
+def _outcomes(
+    agent: Agent,
+    world: World,
+    settings: Settings,
+    ways: dict[bytes, NDArray[np.float64]],
+    on_batch: OnBatch,
+    on_driven: OnDriven,
+) -> dict[float, list[Outcome]]:
+    """For each goal radius, the outcomes of all training seeds under all evaluation seeds."""
+    outcomes: dict[float, list[Outcome]] = {radius: [] for radius in settings.goal_radii}
+    for eval_seed in _eval_seeds(settings):
+        for index, training_seed in enumerate(agent.training_seeds):
+            summaries, trace = agent.drive(index, world, eval_seed, settings, on_batch)
+            on_driven(agent, world, index, (summaries, trace))
+            starts, goals = np.asarray(trace.poses[0]), np.asarray(trace.goals)
+            tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
+            if tasks not in ways:
+                ways[tasks] = shortest_ways(world, starts, goals)
+            for radius, summary in zip(settings.goal_radii, summaries, strict=True):
+                outcomes[radius].append(
+                    Outcome(training_seed, eval_seed, summary, starts, goals, ways[tasks])
+                )
+    return outcomes
+
+
+def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
+    """The key of the episodes of an evaluation seed; every agent gets the same."""
+    return jax.random.fold_in(jax.random.key(eval_seed), list(SPAWN_MODES).index(tasks))
+
+
+def shortest_ways(
+    world: World, starts: NDArray[np.floating], goals: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Length of the shortest way from each start [E, 3] to its goal [E, 2], m."""
+    occupancy_map = world.occupancy_map
+    resolution = occupancy_map.resolution
+    free = traversable(occupancy_map.occupied, resolution, world.env_params.config.robot_radius)
+    places, which = np.unique(goals, axis=0, return_inverse=True)
+    cells = points_to_cells(starts[:, :2], resolution)
+    at_once = max(1, FIELD_CELLS // free.size)
+    lengths = np.empty(len(goals))
+    for first in range(0, len(places), at_once):
+        fields = goal_distance(free, resolution, places[first : first + at_once])
+        chosen = np.flatnonzero((which.reshape(-1) - first) // at_once == 0)
+        lengths[chosen] = fields[
+            which.reshape(-1)[chosen] - first, cells[chosen, 0], cells[chosen, 1]
+        ]
+    return lengths
+
+
+def _eval_seeds(settings: Settings) -> list[int]:
+    return [settings.seed + index for index in range(settings.eval_seeds)]
+
+
+def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
+    config = world.env_params.config
+    return {
+        "agent": agent.name,
+        "algorithm": agent.algorithm,
+        "map": world.occupancy_map.name,
+        "tasks": world.tasks,
+        "velocity_noise": world.noise[0],
+        "velocity_noise_unit": config.velocity_noise_unit,
+        "range_noise": world.noise[1],
+        "range_noise_unit": config.range_noise_unit,
+        "goal_radius": radius,
+    }
+
+
+def _entry(agent: Agent, settings: Settings, outcomes: list[Outcome]) -> dict[str, Any]:
+    return {
+        "training_seeds": list(agent.training_seeds),
+        "eval_seeds": _eval_seeds(settings),
+        "episodes": settings.episodes,
+        **scores.describe(outcomes),
+    }

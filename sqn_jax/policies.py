@@ -1,0 +1,72 @@
+"""Trained policies as an evaluation takes them: read from a run folder, nothing else needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from sqn_jax.agent.networks import Params, initial_carry
+from sqn_jax.checkpoint import FOLDER, Checkpoints
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import Observation
+from sqn_jax.runlog import RunFolder
+from sqn_jax.train import averages, network_of
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The policies of one training run, one for each of its seeds."""
+
+    name: str
+    """The run folder's name."""
+    config: TrainConfig
+    """How they were trained: network, robot, sensors."""
+    params: tuple[Params, ...]
+    """Parameters, one tree a training seed."""
+
+    @property
+    def training_seeds(self) -> tuple[int, ...]:
+        """The seeds, in the order of `params`."""
+        return tuple(self.config.seed + index for index in range(self.config.num_seeds))
+
+
+def params_shapes(config: TrainConfig) -> Params:
+    """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
+
+    They follow from the config alone: the map need not be at hand.
+    """
+    goal_size = 2 if config.env.heading_encoding == "linear" else 3
+    obs = Observation(
+        ranges=jnp.zeros((1, 1, config.env.num_beams)), goal=jnp.zeros((1, 1, goal_size))
+    )
+    carry = initial_carry(config.network, 1)
+    shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
+    if config.num_seeds == 1:
+        return shapes
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((config.num_seeds, *x.shape), x.dtype), shapes
+    )
+
+
+def load_policy(run_dir: Path) -> Policy:
+    """Read the newest checkpoint of a run folder.
+
+    Raises:
+        ValueError: it is no run folder, its config is unusable, or it holds no checkpoint.
+    """
+    _, config = RunFolder.open(run_dir)
+    if not (run_dir / FOLDER).is_dir():
+        raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
+    with Checkpoints(run_dir) as checkpoints:
+        params = checkpoints.restore_policy(params_shapes(config), averaged=averages(config))
+    return Policy(run_dir.resolve().name, config, seeds_of(params, config))
+
+
+def seeds_of(params: Params, config: TrainConfig) -> tuple[Params, ...]:
+    """The parameters of each seed, out of those of a whole run."""
+    if config.num_seeds == 1:
+        return (params,)
+    return tuple(jax.tree.map(lambda x, i=i: x[i], params) for i in range(config.num_seeds))
