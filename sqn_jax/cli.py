@@ -18,7 +18,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 from tqdm import tqdm
 
@@ -26,7 +26,10 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.presets import PRESETS
 
 PAPER_MAPS = ("maze", "column", "forest", "cave")
-TASKS = {"points": "evaluation points", "pairs": "random pairs"}
+TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
+    "points": "evaluation points",
+    "pairs": "random pairs",
+}
 
 USAGE = """usage: sqn COMMAND [OPTIONS]
 

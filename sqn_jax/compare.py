@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,7 +169,8 @@ class Reference:
         else:
             _, trace = navigators.run_bug(key, env_params, count)
         on_batch(count)
-        return [jax.device_get(summarize(trace, radius)) for radius in settings.goal_radii], trace
+        radii = [jnp.float32(radius) for radius in settings.goal_radii]
+        return [jax.device_get(summarize(trace, radius)) for radius in radii], trace
 
 
 def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
@@ -230,7 +232,8 @@ def evaluate_agents(
     Raises:
         ValueError: a map is unusable for a robot.
     """
-    results, records = [], []
+    results: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     quiet: dict[str, list[list[Outcome]]] = {agent.name: [] for agent in agents}
     robots = {agent.name: _robot(agent.env_config, settings) for agent in agents}
     for robot in dict.fromkeys(robots.values()):
@@ -255,14 +258,13 @@ def evaluate_agents(
 
 def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     """The robot and its sensors, without what belongs to training or comes from the settings."""
-    units = {}
-    if settings.noise_unit is not None:
-        units = {
-            "velocity_noise_unit": settings.noise_unit,
-            "range_noise_unit": settings.noise_unit,
-        }
     return dataclasses.replace(
-        env_config, near_goal_fraction=0.0, velocity_noise=0.0, range_noise=0.0, **units
+        env_config,
+        near_goal_fraction=0.0,
+        velocity_noise=0.0,
+        velocity_noise_unit=settings.noise_unit or env_config.velocity_noise_unit,
+        range_noise=0.0,
+        range_noise_unit=settings.noise_unit or env_config.range_noise_unit,
     )
 
 

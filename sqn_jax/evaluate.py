@@ -82,10 +82,12 @@ def run_episodes(
     return [jax.tree.map(lambda x, i=i: x[i], summary) for i in range(len(radii))], trace
 
 
-_EPISODE_AXES = (
-    EpisodeSummary(**{field.name: 1 for field in dataclasses.fields(EpisodeSummary)}),
-    Trace(**{field.name: int(field.name != "goals") for field in dataclasses.fields(Trace)}),
-)
+def _axes(kind: Any, but: str = "") -> Any:
+    """1 in every field of a struct, 0 in the one named."""
+    return kind(**{field.name: int(field.name != but) for field in dataclasses.fields(kind)})
+
+
+_EPISODE_AXES = (_axes(EpisodeSummary), _axes(Trace, but="goals"))
 """Where the axis of episodes stands: summaries are [radii, E], traces [T, E, ...], goals [E]."""
 
 

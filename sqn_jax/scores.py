@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.rollout import EpisodeSummary
 from sqn_jax.statistics import (
@@ -42,7 +42,7 @@ class Outcome:
     def metrics(self) -> dict[str, NDArray[np.float64]]:
         """Every number of an episode by the name it has in the files, [E] each."""
         summary = self.summary
-        named = {
+        named: dict[str, ArrayLike] = {
             "success": summary.success,
             "time_steps": summary.time_steps,
             "mean_reward": summary.mean_reward,

@@ -159,7 +159,7 @@ def train_round(
     on_first_task = jnp.ones(config.num_envs, bool)
     first = (runner.learner, runner.memory, fleet, on_first_task)
     keys = jax.random.split(window_key, windows)
-    (learner, memory, *_), (traces, learning) = jax.lax.scan(body, first, keys)
+    (learner, memory, _fleet, _first), (traces, learning) = jax.lax.scan(body, first, keys)
     trace = join_windows(traces)
     summary = summarize(trace, env_params.goal_radius)
     metrics = {

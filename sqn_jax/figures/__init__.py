@@ -4,6 +4,7 @@ No pyplot, no display, no global state: a figure belongs to nobody until `save` 
 """
 
 from sqn_jax.figures.comparisons import learning_curves, robustness
+from sqn_jax.figures.gallery import map_gallery
 from sqn_jax.figures.runs import DPI, MAX_PATHS, WIDTH_IN, learning_curve, save, trajectories
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "WIDTH_IN",
     "learning_curve",
     "learning_curves",
+    "map_gallery",
     "robustness",
     "save",
     "trajectories",

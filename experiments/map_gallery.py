@@ -1,0 +1,21 @@
+"""Draw the picture of the maps in the README: python experiments/map_gallery.py"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqn_jax import figures
+from sqn_jax.maps import load_map
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "maps.png"
+
+
+def main() -> None:
+    """Write docs/images/maps.png."""
+    maps = [load_map(name) for name in ("maze", "column", "forest", "cave")]
+    figures.save(figures.map_gallery(maps), OUT)
+    print(f"wrote {OUT}")
+
+
+if __name__ == "__main__":
+    main()

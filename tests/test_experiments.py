@@ -1,0 +1,87 @@
+"""The scripts of the paper's table and figure: what they write, and that they train only once."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import common, robustness, table1
+from sqn_jax.compare import Settings
+
+TOLD = {"mean": 0.5, "std": 0.5, "ci95": [0.4, 0.6], "std_of_means": 0.025}
+STEPS = {"mean": 250.0, "std": 9.0, "ci95": [240.0, 260.0], "std_of_means": 4.0}
+
+
+def entry(agent: str, name: str, radius: float) -> dict[str, Any]:
+    return {
+        **{"agent": agent, "algorithm": agent, "map": name, "goal_radius": radius},
+        **{"tasks": "evaluation points", "velocity_noise": 0.0, "range_noise": 0.0},
+        **{"training_seeds": [0], "success": TOLD, "time_steps": STEPS, "spl": TOLD},
+        **{"time_steps_success": None, "collisions": STEPS, "mean_reward": TOLD},
+    }
+
+
+def test_the_table_sets_our_numbers_beside_the_paper_s() -> None:
+    results = [
+        entry(agent, name, radius)
+        for agent in ("sqn", "oracle")
+        for name in ("maze", "cave")
+        for radius in (0.3, 0.5)
+    ]
+    header, _, sqn, oracle = table1.paper_table(results).splitlines()
+    assert [cell.strip() for cell in header.split("|")[2:4]] == ["maze", "cave"]
+    assert "0.50 ± 0.03, 250.0 ± 4.0 (paper 0.98, 181.1)" in sqn
+    assert "(paper 0.82, 767.5)" in sqn
+    assert "paper" not in oracle
+    page = table1.report({"results": results, "comparisons": []}, Settings(maps=("maze", "cave")))
+    assert "goal radius 0.3 m" in page
+    assert "success 0.5 m" in page
+
+
+def call(main: Any, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["script", *words])
+    common.run(main)
+
+
+@pytest.mark.long
+def test_both_scripts_at_a_tiny_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--preset", "smoke", "--algos", "sqn", "dqn", "--num-seeds", "2", "--episodes", "3"]
+    words += ["--eval-seeds", "2", "--runs", str(tmp_path / "runs")]
+    call(table1.main, [*words, "--maps", "maze", "column"], monkeypatch)
+    results = json.loads((tmp_path / "runs" / "table1.json").read_text())
+    assert len(results["results"]) == 4 * 2 * 2  # Agents with the references, maps, radii.
+    assert {(told["first"], told["second"]) for told in results["comparisons"]} == {
+        ("sqn", "dqn"),
+        ("dqn", "sqn"),
+    }
+    assert "paper" in (tmp_path / "runs" / "table1.md").read_text()
+    assert (tmp_path / "runs" / "learning_curves.png").stat().st_size > 10_000
+    capsys.readouterr()
+    call(robustness.main, words, monkeypatch)
+    assert capsys.readouterr().out.count("is trained") == 4
+    results = json.loads((tmp_path / "runs" / "robustness.json").read_text())
+    assert len(results["results"]) == 2 * 7 * 2  # Agents, noises, radii.
+    assert (tmp_path / "runs" / "robustness.png").stat().st_size > 10_000
+
+
+def test_runs_with_other_settings_are_not_taken_for_these(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "sqn_seed0"
+    folder.mkdir()
+    from sqn_jax.config import save
+    from sqn_jax.presets import PRESETS
+
+    save(PRESETS["paper"], folder / "config.json")
+    with pytest.raises(SystemExit) as stopped:
+        call(table1.main, ["--preset", "smoke", "--runs", str(tmp_path)], monkeypatch)
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert "holds a run with other settings" in told
+    assert told.count("\n") == 1
