@@ -58,7 +58,7 @@ class Checkpoints:
         step = self._require_step()
         shapes = _split(runner_shapes)
         items = {name: ocp.args.StandardRestore(item) for name, item in shapes.items()}
-        return _join(self._manager.restore(step, args=ocp.args.Composite(**items)))
+        return _join(self._restored(step, items))
 
     def restore_policy(self, params_shapes: Params, *, averaged: bool) -> Params:
         """Load only the parameters to evaluate, from the newest checkpoint.
@@ -73,8 +73,14 @@ class Checkpoints:
         """
         step = self._require_step()
         name = "target_params" if averaged else "params"
-        args = ocp.args.Composite(**{name: ocp.args.StandardRestore(params_shapes)})
-        return self._manager.restore(step, args=args)[name]
+        return self._restored(step, {name: ocp.args.StandardRestore(params_shapes)})[name]
+
+    def _restored(self, step: int, items: dict[str, Any]) -> Any:
+        try:
+            return self._manager.restore(step, args=ocp.args.Composite(**items))
+        except ValueError as error:
+            place = self._manager.directory / str(step)
+            raise ValueError(f"checkpoint {place}: cannot be read ({error})") from None
 
     def _require_step(self) -> int:
         step = self._manager.latest_step()

@@ -186,6 +186,7 @@ def _evaluate(words: list[str]) -> int:
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder")
     from sqn_jax import compare
+    from sqn_jax.maps import load_map
     from sqn_jax.policies import load_policy
     from sqn_jax.runlog import write_json, write_records
     from sqn_jax.scores import results_table
@@ -206,6 +207,8 @@ def _evaluate(words: list[str]) -> int:
         _require_writable(options.out)
     learnt = compare.group_policies([load_policy(path) for path in options.runs])
     agents = compare.with_references(learnt, references=not options.no_references)
+    for name in options.maps:  # An unusable map is refused before anything is driven.
+        load_map(name)
     with _evaluation_bar(compare.num_episodes(agents, settings)) as bar:
         evaluation, records = compare.evaluate_agents(agents, settings, bar.update)
     print(results_table(evaluation["results"]))

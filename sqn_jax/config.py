@@ -392,7 +392,7 @@ def load(path: Path) -> TrainConfig:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except json.JSONDecodeError as error:
+    except ValueError as error:
         raise ValueError(f"{path}: not valid JSON ({error})") from None
     try:
         return typing.cast(TrainConfig, from_dict(data))
