@@ -9,12 +9,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from sqn_jax.compare import Agent, Settings, evaluate_agents, num_episodes
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.presets import PRESETS
-from sqn_jax.runlog import RunFolder, write_json, write_records
+from sqn_jax.runlog import RunFolder
 from sqn_jax.session import Stopped, train_session
 
 ALGORITHMS: tuple[Algorithm, ...] = ("sqn", "r2d2", "dqn")
@@ -75,20 +72,6 @@ def _train(config: TrainConfig, folder: Path) -> None:
         (folder / "config.json").unlink()
         (folder / "metrics.jsonl").unlink(missing_ok=True)
     train_session(config, folder, resume=has_checkpoint)
-
-
-def evaluate_and_write(agents: list[Agent], settings: Settings, path: Path) -> dict[str, Any]:
-    """Evaluate with a progress bar; writes the evaluation and, beside it, one record an episode."""
-    with tqdm(
-        total=num_episodes(agents, settings),
-        unit=" episodes",
-        mininterval=0.5 if sys.stderr.isatty() else 20,
-        dynamic_ncols=True,
-    ) as bar:
-        evaluation, records = evaluate_agents(agents, settings, bar.update)
-    write_json(path, evaluation)
-    write_records(path.with_suffix(".jsonl"), records)
-    return evaluation
 
 
 def run(main: Any) -> None:

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from sqn_jax import figures
 from sqn_jax.maps import load_map
+from sqn_jax.presets import PAPER_MAPS
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "maps.png"
 
 
 def main() -> None:
     """Write docs/images/maps.png."""
-    maps = [load_map(name) for name in ("maze", "column", "forest", "cave")]
+    maps = [load_map(name) for name in PAPER_MAPS]
     figures.save(figures.map_gallery(maps), OUT)
     print(f"wrote {OUT}")
 

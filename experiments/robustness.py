@@ -11,11 +11,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from experiments.common import add_options, evaluate_and_write, run, runs_folder, train_missing
+from experiments.common import add_options, run, runs_folder, train_missing
 from sqn_jax import figures
 from sqn_jax.compare import Settings, group_policies
 from sqn_jax.policies import load_policy
 from sqn_jax.scores import results_table
+from sqn_jax.session import evaluate_session
 
 VELOCITY_NOISE = (0.1, 0.2, 0.3)
 RANGE_NOISE = (0.2, 0.4, 0.6)
@@ -43,7 +44,7 @@ def main() -> None:
     out: Path = options.out or runs_folder(options)
     out.mkdir(parents=True, exist_ok=True)
     agents = group_policies([load_policy(folder) for folder in folders])
-    evaluation = evaluate_and_write(list(agents), settings, out / "robustness.json")
+    evaluation = evaluate_session(list(agents), settings, out / "robustness.json")
     radius = settings.goal_radii[0]
     shown = [entry for entry in evaluation["results"] if entry["goal_radius"] == radius]
     figure = figures.robustness(

@@ -4,8 +4,8 @@
 
 Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
 table1.jsonl), table1.md and learning_curves.png. On two cores: ten minutes and more a quick run,
-an hour or so a paper run, five minutes in all for smoke, whose robots get 60 steps an episode and
-reach no goal: it shows that everything works.
+an hour or so a paper run, a few minutes in all for smoke, whose robots learn next to nothing: it
+shows that everything works.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from experiments.common import add_options, evaluate_and_write, run, runs_folder, train_missing
+from experiments.common import add_options, run, runs_folder, train_missing
 from sqn_jax import figures
 from sqn_jax.compare import Settings, group_policies, with_references
 from sqn_jax.policies import load_policy
+from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.runlog import RunFolder
 from sqn_jax.scores import markdown_table, results_table
+from sqn_jax.session import evaluate_session
 
 PAPER = {
-    "dqn": {"maze": (0.72, 253.0), "column": (0.95, 151.5), "forest": (0.97, 167.0)},
-    "r2d2": {"maze": (0.70, 257.8), "column": (0.99, 172.4), "forest": (0.91, 221.8)},
-    "sqn": {"maze": (0.98, 181.1), "column": (0.99, 148.7), "forest": (0.93, 171.4)},
+    "dqn": ((0.72, 253.0), (0.95, 151.5), (0.97, 167.0), (0.38, 1061.4)),
+    "r2d2": ((0.70, 257.8), (0.99, 172.4), (0.91, 221.8), (0.64, 937.7)),
+    "sqn": ((0.98, 181.1), (0.99, 148.7), (0.93, 171.4), (0.82, 767.5)),
 }
-"""Success and time steps, table I of the paper; its maps are not published, ours are others."""
-PAPER_CAVE = {"dqn": (0.38, 1061.4), "r2d2": (0.64, 937.7), "sqn": (0.82, 767.5)}
+"""Success and time steps on `PAPER_MAPS`, table I of the paper, whose own maps are not published:
+ours are others."""
 
 
 def paper_table(results: list[dict[str, Any]]) -> str:
@@ -45,11 +47,9 @@ def paper_table(results: list[dict[str, Any]]) -> str:
                 if (entry["agent"], entry["map"], entry["goal_radius"]) == (agent, name, radius)
             )
             told = f"{_spread(entry['success'], 2)}, {_spread(entry['time_steps'], 1)}"
-            theirs = PAPER.get(entry["algorithm"], {}).get(name)
-            if name == "cave":
-                theirs = PAPER_CAVE.get(entry["algorithm"])
-            if theirs:
-                told += f" (paper {theirs[0]:.2f}, {theirs[1]:.1f})"
+            if name in PAPER_MAPS and entry["algorithm"] in PAPER:
+                success, steps = PAPER[entry["algorithm"]][PAPER_MAPS.index(name)]
+                told += f" (paper {success:.2f}, {steps:.1f})"
             row.append(told)
         rows.append(row)
     return markdown_table(["agent: success, time steps", *maps], rows)
@@ -89,7 +89,7 @@ def main() -> None:
     """Parse the options, train, evaluate, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add_options(parser)
-    parser.add_argument("--maps", nargs="+", default=["maze", "column", "forest", "cave"])
+    parser.add_argument("--maps", nargs="+", default=list(PAPER_MAPS))
     options = parser.parse_args()
     settings = Settings(
         maps=tuple(options.maps), episodes=options.episodes, eval_seeds=options.eval_seeds
@@ -105,7 +105,7 @@ def main() -> None:
     figures.save(figure, out / "learning_curves.png")
     learnt = group_policies([load_policy(folder) for folder in folders])
     agents = with_references(learnt, references=True)
-    evaluation = evaluate_and_write(agents, settings, out / "table1.json")
+    evaluation = evaluate_session(agents, settings, out / "table1.json")
     page = report(evaluation, settings)
     (out / "table1.md").write_text(page, encoding="utf-8")
     print(page)

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
+from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 from sqn_jax.planners import wrap
 
-STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
 FINENESS = 3
 """Directions looked at for each turn of one step."""
 SIDE_ROOM = 0.06

@@ -78,7 +78,7 @@ class Checkpoints:
     def _restored(self, step: int, items: dict[str, Any]) -> Any:
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**items))
-        except ValueError as error:
+        except (ValueError, KeyError, OSError) as error:
             place = self._manager.directory / str(step)
             raise ValueError(f"checkpoint {place}: cannot be read ({error})") from None
 

@@ -20,12 +20,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NoReturn
 
-from tqdm import tqdm
-
 from sqn_jax.config import TrainConfig
-from sqn_jax.presets import PRESETS
+from sqn_jax.presets import PAPER_MAPS, PRESETS
 
-PAPER_MAPS = ("maze", "column", "forest", "cave")
 TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
     "points": "evaluation points",
     "pairs": "random pairs",
@@ -179,6 +176,7 @@ def _evaluate(words: list[str]) -> int:
     add("--velocity-noise", nargs="+", type=float, default=[], metavar="S", help="e.g. 0.1 0.2")
     add("--range-noise", nargs="+", type=float, default=[], metavar="P", help="e.g. 0.2 0.4")
     add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
+    add("--max-steps", type=int, default=0, help="steps an episode (default: as each map says)")
     add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
@@ -186,10 +184,9 @@ def _evaluate(words: list[str]) -> int:
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder")
     from sqn_jax import compare
-    from sqn_jax.maps import load_map
     from sqn_jax.policies import load_policy
-    from sqn_jax.runlog import write_json, write_records
     from sqn_jax.scores import results_table
+    from sqn_jax.session import evaluate_session
 
     noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
     noise += [(0.0, level) for level in options.range_noise if level != 0]
@@ -202,15 +199,13 @@ def _evaluate(words: list[str]) -> int:
         noise=((0.0, 0.0), *noise),
         noise_unit=options.noise_unit,
         goal_radii=tuple(options.goal_radius),
+        max_steps=options.max_steps,
     )
     if options.out is not None:
         _require_writable(options.out)
     learnt = compare.group_policies([load_policy(path) for path in options.runs])
     agents = compare.with_references(learnt, references=not options.no_references)
-    for name in options.maps:  # An unusable map is refused before anything is driven.
-        load_map(name)
-    with _evaluation_bar(compare.num_episodes(agents, settings)) as bar:
-        evaluation, records = compare.evaluate_agents(agents, settings, bar.update)
+    evaluation = evaluate_session(agents, settings, options.out)
     print(results_table(evaluation["results"]))
     for told in evaluation["comparisons"]:
         low, high = told["ci95"]
@@ -219,8 +214,6 @@ def _evaluate(words: list[str]) -> int:
             f"{told['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
         )
     if options.out is not None:
-        write_json(options.out, evaluation)
-        write_records(options.out.with_suffix(".jsonl"), records)
         print(f"wrote {options.out}")
     return 0
 
@@ -230,16 +223,6 @@ def _require_writable(path: Path) -> None:
         raise ValueError(f"--out is {path}, expected a file ending in .json")
     if not path.parent.is_dir() or path.is_dir():
         raise ValueError(f"--out {path}: expected a file in an existing folder")
-
-
-def _evaluation_bar(num_episodes: int) -> tqdm[NoReturn]:
-    return tqdm(
-        total=num_episodes,
-        mininterval=0.5 if sys.stderr.isatty() else 20,
-        dynamic_ncols=True,
-        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
-        "[{elapsed}, {remaining} left]",
-    )
 
 
 def _map(words: list[str]) -> int:

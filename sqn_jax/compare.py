@@ -7,7 +7,7 @@ returns what the evaluation file holds. What is said on screen is up to the call
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -20,7 +20,7 @@ from sqn_jax import evaluate, navigators, scores
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.env.prepare import with_noise
-from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
+from sqn_jax.maps import OccupancyMap, goal_fields, load_map, points_to_cells, traversable
 from sqn_jax.policies import Policy
 from sqn_jax.rollout import EpisodeSummary, Trace, summarize
 from sqn_jax.scores import Outcome
@@ -32,11 +32,10 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
 }
 """The two kinds of tasks, and the spawn mode that draws them."""
 
-FIELD_CELLS = 4_000_000
-"""Cells of goal-distance fields that are held at a time."""
-
 Driven = tuple[list[EpisodeSummary], Trace]
 """A summary for each goal radius, and the trace."""
+Maps = Mapping[tuple[str, float], OccupancyMap]
+"""Maps by their name in the settings and the radius of the robot, m, they were loaded for."""
 OnBatch = Callable[[int], object]
 OnDriven = Callable[["Agent", "World", int, Driven], object]
 
@@ -60,11 +59,15 @@ class Settings:
     """Reading of both, see `EnvConfig`; None as each robot was configured."""
     goal_radii: tuple[float, ...] = (0.3, 0.5)
     """m; each radius is judged from the same episodes."""
+    max_steps: int = 0
+    """Steps an episode; 0 for each map's own limit."""
 
     def __post_init__(self) -> None:
         for name in ("episodes", "eval_seeds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
+        if self.max_steps < 0:
+            raise ValueError(f"max_steps is {self.max_steps}, expected 0 or a positive number")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed is {self.seed}, expected a number from 0 to 2147483647")
         for level in (level for pair in self.noise for level in pair):
@@ -211,8 +214,23 @@ def num_episodes(agents: Sequence[Agent], settings: Settings) -> int:
     return worlds * policies * settings.eval_seeds * settings.episodes
 
 
+def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
+    """The maps of an evaluation, for every robot that is to drive on them.
+
+    Raises:
+        ValueError: a map is unusable for a robot.
+    """
+    radii = dict.fromkeys(agent.env_config.robot_radius for agent in agents)
+    return {
+        (name, radius): load_map(name, robot_radius=radius)
+        for name in settings.maps
+        for radius in radii
+    }
+
+
 def evaluate_agents(
     agents: Sequence[Agent],
+    maps: Maps,
     settings: Settings,
     on_batch: OnBatch = lambda count: None,
     on_driven: OnDriven = lambda agent, world, index, driven: None,
@@ -221,6 +239,7 @@ def evaluate_agents(
 
     Args:
         agents: who drives; names must differ.
+        maps: from `load_maps`.
         settings: where, how often and under what noise.
         on_batch: called with the number of episodes just driven.
         on_driven: called with agent, world, index of the training seed and what was driven, for
@@ -228,9 +247,6 @@ def evaluate_agents(
 
     Returns:
         The evaluation file (`schema`, `results`, `comparisons`), and one record an episode.
-
-    Raises:
-        ValueError: a map is unusable for a robot.
     """
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
@@ -238,7 +254,7 @@ def evaluate_agents(
     robots = {agent.name: _robot(agent.env_config, settings) for agent in agents}
     for robot in dict.fromkeys(robots.values()):
         ways: dict[bytes, NDArray[np.float64]] = {}
-        for world in _worlds(robot, settings):
+        for world in _worlds(robot, maps, settings):
             for agent in (agent for agent in agents if robots[agent.name] == robot):
                 outcomes = _outcomes(agent, world, settings, ways, on_batch, on_driven)
                 for radius, of_radius in outcomes.items():
@@ -260,6 +276,7 @@ def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     """The robot and its sensors, without what belongs to training or comes from the settings."""
     return dataclasses.replace(
         env_config,
+        max_steps=settings.max_steps,
         near_goal_fraction=0.0,
         velocity_noise=0.0,
         velocity_noise_unit=settings.noise_unit or env_config.velocity_noise_unit,
@@ -268,9 +285,9 @@ def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     )
 
 
-def _worlds(robot: EnvConfig, settings: Settings) -> Iterator[World]:
+def _worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
     for name in settings.maps:
-        occupancy_map = load_map(name, robot_radius=robot.robot_radius)
+        occupancy_map = maps[name, robot.robot_radius]
         for tasks in settings.tasks:
             quiet = make_env(occupancy_map, robot, spawn=SPAWN_MODES[tasks])
             for noise in settings.noise:
@@ -314,16 +331,10 @@ def shortest_ways(
     occupancy_map = world.occupancy_map
     resolution = occupancy_map.resolution
     free = traversable(occupancy_map.occupied, resolution, world.env_params.config.robot_radius)
-    places, which = np.unique(goals, axis=0, return_inverse=True)
-    cells = points_to_cells(starts[:, :2], resolution)
-    at_once = max(1, FIELD_CELLS // free.size)
+    row, col = points_to_cells(starts[:, :2], resolution).T
     lengths = np.empty(len(goals))
-    for first in range(0, len(places), at_once):
-        fields = goal_distance(free, resolution, places[first : first + at_once])
-        chosen = np.flatnonzero((which.reshape(-1) - first) // at_once == 0)
-        lengths[chosen] = fields[
-            which.reshape(-1)[chosen] - first, cells[chosen, 0], cells[chosen, 1]
-        ]
+    for same, field in goal_fields(free, resolution, goals):
+        lengths[same] = field[row[same], col[same]]
     return lengths
 
 

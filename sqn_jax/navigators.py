@@ -29,6 +29,7 @@ from scipy import ndimage
 
 from sqn_jax.bug import BugNavigator
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
+from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 from sqn_jax.evaluate import episode_keys, start_by_hand, step_by_hand
 from sqn_jax.maps import OccupancyMap, traversable
 from sqn_jax.planners import Ways, wrap
@@ -38,7 +39,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Choose = Callable[[Observation, EnvState], Ints]
 
-STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
 INVERSE = np.array([-1, BACKWARD, FORWARD, RIGHT, LEFT])
 
 BEAM = 100

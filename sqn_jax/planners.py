@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sqn_jax.maps.distance import clear_moves, goal_distance
+from sqn_jax.maps.distance import clear_moves, goal_fields
 from sqn_jax.maps.occupancy import OccupancyMap, points_to_cells, traversable
 
 HEADINGS = 20  # multiples of 18 degrees, the turn of one step
@@ -31,8 +31,6 @@ JUMPS = 3
 """The direction of a way is that of its next 2 ** JUMPS moves, 0.4 to 1.4 m together."""
 BEND_SLACK = 0.1
 """rad; smaller bends come from the grid's few directions, not from the map."""
-FIELD_CELLS = 30_000_000
-"""Cells of distance fields computed at once."""
 
 
 def move_offsets(step: float, resolution: float) -> NDArray[np.int64]:
@@ -149,8 +147,7 @@ class Ways:
         self, free: NDArray[np.bool_], resolution: float, goals: NDArray[np.float64], turn: float
     ) -> None:
         """Compute the ways to goals [E, 2]; a goal that occurs twice is computed once."""
-        places, which = np.unique(goals, axis=0, return_inverse=True)
-        self.which = which.reshape(-1)
+        self.which = np.empty(len(goals), np.int64)
         self.resolution, self.turn = resolution, turn
         rows, cols = np.nonzero(free)
         self.centres = np.stack([cols + 0.5, rows + 0.5], axis=-1) * resolution
@@ -161,17 +158,16 @@ class Ways:
             for i, j in MOVES
             for clear in [clear_moves(free, i, j)[rows, cols]]
         ]
-        size = (len(places), len(rows))
+        size = (len(np.unique(goals, axis=0)), len(rows))
         self.length = np.empty(size, np.float32)
         self.direction = np.empty(size, np.float32)
         self.bends = np.empty(size, np.float32)
-        together = max(1, FIELD_CELLS // free.size)
-        for first in range(0, len(places), together):
-            part = places[first : first + together]
-            lengths = goal_distance(free, resolution, part)[:, rows, cols]
-            for i, (place, length) in enumerate(zip(part, lengths, strict=True), first):
-                self.length[i] = length
-                self.direction[i], self.bends[i] = self._follow(place, length)
+        for number, (same, field) in enumerate(goal_fields(free, resolution, goals)):
+            self.which[same] = number
+            self.length[number] = field[rows, cols]
+            self.direction[number], self.bends[number] = self._follow(
+                goals[same[0]], self.length[number]
+            )
 
     def _shifted(self, d_row: int, d_col: int) -> NDArray[np.int64]:
         """Number of the cell at an offset from each free cell; wrong beyond the map's border."""

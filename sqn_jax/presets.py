@@ -61,5 +61,8 @@ def _smoke() -> TrainConfig:
     )
 
 
+PAPER_MAPS = ("maze", "column", "forest", "cave")
+"""The four kinds of maps the paper evaluates on, by the names of ours."""
+
 PRESETS: dict[str, TrainConfig] = {"quick": _quick(), "paper": TrainConfig(), "smoke": _smoke()}
 """`quick` is the default, `paper` follows the paper to the letter, `smoke` is for tests."""

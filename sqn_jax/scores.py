@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ class Outcome:
     shortest: NDArray[np.floating] | None = None
     """[E] m, length of the shortest way from start to goal; None where it was not worked out."""
 
+    @cached_property
     def metrics(self) -> dict[str, NDArray[np.float64]]:
         """Every number of an episode by the name it has in the files, [E] each."""
         summary = self.summary
@@ -72,7 +74,7 @@ def describe(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         With several training seeds also `iqm` and `iqm_ci95`, the interquartile mean over them;
         the intervals over episodes say nothing of how much training seeds differ.
     """
-    metrics = [outcome.metrics() for outcome in outcomes]
+    metrics = [outcome.metrics for outcome in outcomes]
     result: dict[str, Any] = {}
     names = ("success", "time_steps", "spl", "mean_reward", "collisions", "coverage_m2")
     for name in names:
@@ -80,8 +82,7 @@ def describe(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         result[name] = _describe(name, values, outcomes) if len(values) == len(metrics) else None
     steps = [metric["time_steps"][metric["success"] > 0] for metric in metrics]
     result["time_steps_success"] = _over_episodes(np.concatenate(steps))
-    seeds = list(dict.fromkeys(outcome.training_seed for outcome in outcomes))
-    result["success_per_seed"] = [_of_seed("success", seed, outcomes) for seed in seeds]
+    result["success_per_seed"] = _of_each_seed("success", outcomes)
     return result
 
 
@@ -94,18 +95,19 @@ def _describe(
     if name == "success":
         told["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
     told["std_of_means"] = float(np.std([value.mean() for value in values]))
-    seeds = list(dict.fromkeys(outcome.training_seed for outcome in outcomes))
-    if len(seeds) > 1:
-        scores = [_of_seed(name, seed, outcomes) for seed in seeds]
+    scores = _of_each_seed(name, outcomes)
+    if len(scores) > 1:
         told["iqm"] = interquartile_mean(scores)
         told["iqm_ci95"] = list(stratified_bootstrap([scores], interquartile_mean))
     return told
 
 
-def _of_seed(name: str, seed: int | None, outcomes: Sequence[Outcome]) -> float:
-    """Mean of a metric over all episodes of a training seed."""
-    chosen = [outcome for outcome in outcomes if outcome.training_seed == seed]
-    return float(np.concatenate([outcome.metrics()[name] for outcome in chosen]).mean())
+def _of_each_seed(name: str, outcomes: Sequence[Outcome]) -> list[float]:
+    """Mean of a metric over all episodes of each training seed."""
+    by_seed: dict[int | None, list[NDArray[np.float64]]] = {}
+    for outcome in outcomes:
+        by_seed.setdefault(outcome.training_seed, []).append(outcome.metrics[name])
+    return [float(np.concatenate(values).mean()) for values in by_seed.values()]
 
 
 def _over_episodes(values: NDArray[np.float64]) -> dict[str, Any] | None:
@@ -128,14 +130,11 @@ def improvement(ours: Sequence[Sequence[Outcome]], theirs: Sequence[Sequence[Out
     Returns:
         `probability` and its `ci95` over training seeds; None unless both agents have several.
     """
-    tables = []
-    for agent in (ours, theirs):
-        seeds = list(dict.fromkeys(outcome.training_seed for outcome in agent[0]))
-        if len(seeds) < 2:
-            return None
-        tables.append(
-            np.array([[_of_seed("success", seed, task) for task in agent] for seed in seeds])
-        )
+    tables = [
+        np.array([_of_each_seed("success", task) for task in agent]).T for agent in (ours, theirs)
+    ]
+    if any(len(table) < 2 for table in tables):
+        return None
     return {
         "probability": probability_of_improvement(*tables),
         "ci95": list(stratified_bootstrap(tables, probability_of_improvement)),
@@ -145,7 +144,7 @@ def improvement(ours: Sequence[Sequence[Outcome]], theirs: Sequence[Sequence[Out
 def records(outcomes: Sequence[Outcome], **labels: Any) -> Iterator[dict[str, Any]]:
     """One flat object an episode, ready for JSON lines."""
     for outcome in outcomes:
-        metrics = outcome.metrics()
+        metrics = outcome.metrics
         for episode in range(len(outcome.goals)):
             yield {
                 **labels,

@@ -1,4 +1,4 @@
-"""A whole training run as a person starts it: folder, progress, checkpoints, evaluation, figures.
+"""A training run or an evaluation as a person starts it: progress, checkpoints, files, figures.
 
 The numbers come from `train` and `evaluate`; this module decides what is said and written when.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -20,13 +20,22 @@ from tqdm import tqdm
 
 import sqn_jax
 from sqn_jax.checkpoint import Checkpoints
-from sqn_jax.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
+from sqn_jax.compare import (
+    Agent,
+    Driven,
+    Learnt,
+    Settings,
+    World,
+    evaluate_agents,
+    load_maps,
+    num_episodes,
+)
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies import Policy, seeds_of
 from sqn_jax.rollout import EpisodeSummary, Trace
-from sqn_jax.runlog import RunFolder
+from sqn_jax.runlog import RunFolder, write_json, write_records
 from sqn_jax.train import (
     ChunkReport,
     RunnerState,
@@ -68,7 +77,7 @@ def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -
     with Checkpoints(run_dir) as checkpoints:
         runner, seconds_before = _first_state(config, env_params, folder, checkpoints, resume)
         runner, timing = _train(runner, env_params, config, folder, checkpoints, seconds_before)
-    results, drawn = _evaluate(runner, config, folder)
+    results, drawn = _evaluate(runner, occupancy_map, config, folder)
     figures = _draw(drawn, occupancy_map, config, folder)
     _conclude(results, timing, figures, config, folder)
 
@@ -121,7 +130,8 @@ def _train(
     print(f"\rcompiled in {timing['compile_seconds']:.1f} s")
     last_saved = time.monotonic()
     rounds_done = int(np.max(np.asarray(runner.round)))
-    with _signals() as received, _bar(config, rounds_done * config.num_envs) as bar:
+    total = config.num_rounds * config.num_envs
+    with _signals() as received, _bar(total, rounds_done * config.num_envs) as bar:
         for runner, report in run(runner, env_params, config, program):  # noqa: B020
             timing["train_seconds"] += report.seconds
             timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
@@ -139,10 +149,35 @@ def _train(
     return runner, timing
 
 
-def _bar(config: TrainConfig, episodes_done: int) -> tqdm[Any]:
+def evaluate_session(
+    agents: Sequence[Agent], settings: Settings, out: Path | None = None
+) -> dict[str, Any]:
+    """Evaluate agents under a progress bar.
+
+    Args:
+        agents: who drives; see `compare.evaluate_agents`.
+        settings: where and how often.
+        out: where to write the evaluation, a JSON file, and beside it one record an episode.
+
+    Returns:
+        The evaluation as written.
+
+    Raises:
+        ValueError: a map is unusable for a robot; nothing was driven then.
+    """
+    maps = load_maps(agents, settings)
+    with _bar(num_episodes(agents, settings)) as bar:
+        evaluation, records = evaluate_agents(agents, maps, settings, bar.update)
+    if out is not None:
+        write_json(out, evaluation)
+        write_records(out.with_suffix(".jsonl"), records)
+    return evaluation
+
+
+def _bar(episodes: int, done: int = 0) -> tqdm[Any]:
     return tqdm(
-        total=config.num_rounds * config.num_envs,
-        initial=episodes_done,
+        total=episodes,
+        initial=done,
         mininterval=0.5 if sys.stderr.isatty() else 20,
         smoothing=0.1,
         dynamic_ncols=True,
@@ -199,7 +234,7 @@ Drawn = dict[str, tuple[EpisodeSummary, Trace]]
 
 
 def _evaluate(
-    runner: RunnerState, config: TrainConfig, folder: RunFolder
+    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> tuple[list[dict[str, Any]], Drawn]:
     """Greedy episodes of every seed from the evaluation points and from random pairs."""
     policy = Policy(
@@ -213,6 +248,7 @@ def _evaluate(
         seed=config.eval.seed,
         noise=((config.env.velocity_noise, config.env.range_noise),),
         goal_radii=(config.env.goal_radius,),
+        max_steps=config.env.max_steps,
     )
     drawn: Drawn = {}
 
@@ -221,7 +257,10 @@ def _evaluate(
             drawn[world.tasks] = (driven[0][0], driven[1])
 
     evaluation, records = evaluate_agents(
-        [Learnt(config.algo, (policy,))], settings, on_driven=keep
+        [Learnt(config.algo, (policy,))],
+        {(config.map, config.env.robot_radius): occupancy_map},
+        settings,
+        on_driven=keep,
     )
     folder.write_json("evaluation.json", evaluation)
     folder.write_records("evaluation.jsonl", records)

@@ -15,19 +15,29 @@ import pytest
 from sqn_jax.cli import main
 from sqn_jax.compare import (
     Learnt,
+    Reference,
     Settings,
     World,
     group_policies,
+    load_maps,
     num_episodes,
     shortest_ways,
     with_references,
 )
-from sqn_jax.config import TrainConfig
+from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.env import make_env
-from sqn_jax.maps import goal_distance, load_map, points_to_cells, traversable
+from sqn_jax.maps import (
+    OccupancyMap,
+    goal_distance,
+    load_map,
+    points_to_cells,
+    save_map,
+    traversable,
+)
 from sqn_jax.policies import Policy, load_policy
 
 TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4", "--num-seeds", "2"]
+AS_TRAINED = ["--maps", "maze", "--max-steps", "30"]
 EPISODES, EVAL_SEEDS = 3, 2
 
 
@@ -43,7 +53,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def evaluated(run_dir: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Results and records of the tiny run and the references, with and without noise."""
-    words = ["evaluate", str(run_dir), "--maps", "maze", "--episodes", str(EPISODES)]
+    words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", str(EPISODES)]
     words += ["--eval-seeds", str(EVAL_SEEDS), "--velocity-noise", "0.2", "--range-noise", "0.4"]
     assert main([*words, "--out", str(run_dir.parent / "found.json")]) == 0
     found = json.loads((run_dir.parent / "found.json").read_text())
@@ -91,7 +101,7 @@ def test_every_agent_meets_the_same_tasks_under_every_noise(
 
 def test_the_policy_is_the_one_the_training_ended_with(run_dir: Path, tmp_path: Path) -> None:
     """The same episodes as in the run's own evaluation, from the run folder alone."""
-    words = ["evaluate", str(run_dir), "--maps", "maze", "--episodes", "4", "--eval-seeds", "1"]
+    words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", "4", "--eval-seeds", "1"]
     words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-references"]
     assert main([*words, "--out", str(tmp_path / "again.json")]) == 0
     again = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
@@ -133,7 +143,7 @@ def test_the_shortest_ways_are_read_off_each_goal_s_own_field(
     goals = occupancy_map.spawn_points[[3, 9, 9, 40, 3, 22, 50]]
     starts = np.concatenate([places, np.zeros((7, 1))], axis=1)
     # Two fields at a time, so that the last batch is not full.
-    monkeypatch.setattr("sqn_jax.compare.FIELD_CELLS", 2 * 340 * 340)
+    monkeypatch.setattr("sqn_jax.maps.distance.FIELD_CELLS", 2 * 340 * 340)
     world = World(occupancy_map, env_params, "random pairs", (0.0, 0.0))
     found = shortest_ways(world, starts, goals)
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, 0.1)
@@ -143,6 +153,61 @@ def test_the_shortest_ways_are_read_off_each_goal_s_own_field(
         assert found[episode] == pytest.approx(field[row, column])
         straight = np.hypot(*(goals[episode] - starts[episode, :2]))
         assert found[episode] >= straight - 0.05
+
+
+def test_the_step_limit_is_the_map_s_whatever_the_run_was_trained_with(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    words = ["evaluate", str(run_dir), "--maps", "column", "--episodes", "1", "--eval-seeds", "1"]
+    assert main([*words, "--no-references", "--out", str(tmp_path / "found.json")]) == 0
+    lines = (tmp_path / "found.jsonl").read_text().splitlines()
+    failures = [record for record in map(json.loads, lines) if not record["success"]]
+    assert {record["time_steps"] for record in failures} == {load_map("column").max_steps}
+
+
+def test_a_map_is_judged_by_each_robot_s_own_radius(tmp_path: Path) -> None:
+    """A gap of 0.3 m between start and goal: wide enough for one robot, too narrow for another."""
+    occupied = np.zeros((40, 60), dtype=bool)
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    occupied[:, 30] = True
+    occupied[17:23, 30] = False
+    points = np.array([[0.525, 1.0], [2.525, 1.0]])
+    save_map(
+        OccupancyMap("gap", occupied, 0.05, points, points, max_steps=50), tmp_path / "gap.yaml"
+    )
+    agents = [Reference("bug", EnvConfig(robot_radius=radius)) for radius in (0.1, 0.05)]
+    settings = Settings(maps=(str(tmp_path / "gap.yaml"),), episodes=1)
+    assert set(load_maps(agents, settings)) == {(settings.maps[0], 0.1), (settings.maps[0], 0.05)}
+    agents.append(Reference("bug", EnvConfig(robot_radius=0.2)))
+    with pytest.raises(ValueError, match="gap"):
+        load_maps(agents, settings)
+
+
+def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refusal(words: list[str]) -> str:
+        capsys.readouterr()
+        assert main(["evaluate", *words, "--no-references", "--episodes", "1"]) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("sqn: ")
+        assert told.count("\n") == 1, told
+        return told
+
+    no_yaml = tmp_path / "bad.yaml"
+    no_yaml.write_text("image: [")
+    assert "bad.yaml" in refusal([str(run_dir), "--maps", "maze", str(no_yaml)])
+    for number, (name, text) in enumerate(
+        [("config.json", "{"), ("config.json", "[]"), ("checkpoints", "")]
+    ):
+        broken = tmp_path / str(number)
+        shutil.copytree(run_dir, broken)
+        if name == "checkpoints":
+            newest = max((broken / name).glob("[0-9]*"), key=lambda step: int(step.name))
+            shutil.rmtree(newest / "target_params")
+        else:
+            (broken / name).write_text(text)
+        assert name in refusal([str(broken)])
 
 
 def test_a_run_without_a_checkpoint_is_named(
@@ -167,6 +232,7 @@ def test_a_run_without_a_checkpoint_is_named(
         (["--velocity-noise", "-0.1"], ["noise", "-0.1"]),
         (["--range-noise", "nan"], ["noise", "nan"]),
         (["--goal-radius", "0"], ["goal radius", "0"]),
+        (["--max-steps", "-1"], ["max_steps", "-1"]),
         (["--maps", "nowhere"], ["nowhere", "maze"]),
         (["--out", "found.txt"], ["--out", ".json"]),
         (["--out", "no/such/folder/found.json"], ["--out", "existing folder"]),

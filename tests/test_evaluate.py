@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rooms import random_params, small_room
 
 from sqn_jax import evaluate
-from sqn_jax.agent import initial_carry, make_network
+from sqn_jax.agent import make_network
 from sqn_jax.config import Algorithm, EnvConfig, NetworkConfig
 from sqn_jax.env import EnvParams, make_env, step
 from sqn_jax.env.prepare import with_noise
-from sqn_jax.maps import OccupancyMap
 from sqn_jax.rollout import EpisodeSummary, Trace, summarize
 
 LENGTH = 25
@@ -24,33 +24,14 @@ NETWORK = NetworkConfig(hidden_size=16)
 
 @pytest.fixture(scope="module")
 def room() -> EnvParams:
-    """3 x 4 m with a wall in the middle, under noise on command and readings."""
-    occupied = np.zeros((30, 40), dtype=bool)
-    occupied[[0, -1]] = occupied[:, [0, -1]] = True
-    occupied[14:16, 12:28] = True
-    corners = np.array([[0.65, 0.65], [3.35, 0.65], [0.65, 2.35], [3.35, 2.35]])
-    plan = OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=LENGTH)
-    return make_env(plan, EnvConfig(velocity_noise=0.2, range_noise=0.3))
-
-
-def random_params(algo: Algorithm, env_params: EnvParams, seed: int = 0) -> Any:
-    """Weights large enough that greedy robots do different things."""
-    network = make_network(algo, NETWORK, 5)
-
-    def initial(key: jax.Array) -> Any:
-        _, fleet = evaluate.start_episode(key, network, env_params)
-        obs = jax.tree.map(lambda x: x[None], fleet.obs)
-        return network.init(key, obs, initial_carry(NETWORK, 1))
-
-    shapes = jax.eval_shape(initial, jax.random.key(0))
-    rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
+    """Under noise on command and readings."""
+    return small_room(LENGTH, velocity_noise=0.2, range_noise=0.3)
 
 
 def drive(
     keys: jax.Array, env_params: EnvParams, algo: Algorithm = "sqn", seed: int = 0, **how: Any
 ) -> tuple[list[EpisodeSummary], Trace]:
-    params = random_params(algo, env_params, seed)
+    params = random_params(make_network(algo, NETWORK, 5), env_params, seed)
     return evaluate.run_episodes(keys, params, env_params, algo=algo, network_config=NETWORK, **how)
 
 

@@ -14,16 +14,22 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle
 from PIL import Image
 
-from sqn_jax.figures import runs as figures
+from sqn_jax import figures
+from sqn_jax.figures import curves, paths, style
 from sqn_jax.maps import OccupancyMap
 
 FULL_DPI = figures.DPI
 
 
+def set_dpi(monkeypatch, dpi):
+    for module in (curves, paths, style):
+        monkeypatch.setattr(module, "DPI", dpi)
+
+
 @pytest.fixture(autouse=True)
 def _coarse_pixels(monkeypatch):
     """Rendering gets quicker, and only the layout depends on the resolution."""
-    monkeypatch.setattr(figures, "DPI", 60)
+    set_dpi(monkeypatch, 60)
 
 
 # ---------------------------------------------------------------------------------- learning curve
@@ -408,7 +414,7 @@ def test_random_pairs_are_chosen_far_apart():
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_no_text_overlaps_another(count, monkeypatch):
     """Titles, tick labels, axis labels and the legend, on rendered boxes at full resolution."""
-    monkeypatch.setattr(figures, "DPI", FULL_DPI)
+    set_dpi(monkeypatch, FULL_DPI)
     goals = [GOALS[i % count] for i in range(2 * count)]
     figure = draw(episodes(goals, [True, False] * count, [5, 30] * count), max_panels=5)
     check_texts(drawn(figure))
@@ -417,7 +423,7 @@ def test_no_text_overlaps_another(count, monkeypatch):
 @pytest.mark.parametrize("skills", [1, 4])
 @pytest.mark.parametrize("make", [row, seeds_row])
 def test_no_text_of_a_learning_curve_overlaps_another(skills, make, monkeypatch):
-    monkeypatch.setattr(figures, "DPI", FULL_DPI)
+    set_dpi(monkeypatch, FULL_DPI)
     rows = [make(chunk) for chunk in range(1, 9)]
     usage = np.broadcast_to(1 / skills, (3, skills)).tolist()
     rows = [r | {"skill_usage": usage if make is seeds_row else usage[0]} for r in rows]
@@ -482,7 +488,7 @@ def test_a_saved_figure_is_a_png_of_the_figures_size_and_nothing_else_is_left(tm
     with Image.open(path) as image:
         image.load()
         assert image.format == "PNG"
-        assert image.width == round(figures.WIDTH_IN * figures.DPI)
+        assert image.width == round(style.WIDTH_IN * style.DPI)
     assert [p.name for p in path.parent.iterdir()] == ["curve.png"]
 
 

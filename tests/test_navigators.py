@@ -16,10 +16,10 @@ from sqn_jax.bug import BugNavigator
 from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import EnvParams, make_env, reset
 from sqn_jax.env.dynamics import move
-from sqn_jax.env.navigation import MOTION_ITERATIONS
+from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluate import episode_keys, run_episodes
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
-from sqn_jax.navigators import FORWARD, STAND, BeamSearch, Oracle, drive, run_bug, run_oracle
+from sqn_jax.navigators import BeamSearch, Oracle, drive, run_bug, run_oracle
 from sqn_jax.planners import HEADINGS, Ways, oracle_steps
 
 KEY = jax.random.key(11)

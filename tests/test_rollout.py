@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from rooms import random_params, small_room
 from scipy import stats
 
-from sqn_jax.agent import initial_carry, make_network
-from sqn_jax.config import EnvConfig, NetworkConfig
-from sqn_jax.env import EnvParams, make_env, step, true_ranges
-from sqn_jax.maps import OccupancyMap
+from sqn_jax.agent import make_network
+from sqn_jax.config import NetworkConfig
+from sqn_jax.env import EnvParams, step, true_ranges
 from sqn_jax.rollout import (
     Fleet,
     Trace,
@@ -43,28 +43,14 @@ def quick_compilation() -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-def small_room(**changes: Any) -> EnvParams:
-    """A room of 3 x 4 m, not square, with a wall in the middle, and spawn points in its corners."""
-    occupied = np.zeros((30, 40), dtype=bool)
-    occupied[[0, -1]] = occupied[:, [0, -1]] = True
-    occupied[14:16, 12:28] = True
-    corners = np.array([[0.65, 0.65], [3.35, 0.65], [0.65, 2.35], [3.35, 2.35]])
-    room = OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=LENGTH)
-    return make_env(room, EnvConfig(**changes))
-
-
 @pytest.fixture(scope="module")
 def room() -> EnvParams:
-    return small_room()
+    return small_room(LENGTH)
 
 
 @pytest.fixture(scope="module")
 def params(room: EnvParams) -> Any:
-    """Weights large enough that greedy robots do different things."""
-    rng = np.random.default_rng(0)
-    obs = jax.tree.map(lambda x: x[None], start(jax.random.key(0), 1, NETWORK, room).obs)
-    shapes = jax.eval_shape(NETWORK.init, jax.random.key(0), obs, initial_carry(NETWORK.config, 1))
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
+    return random_params(NETWORK, room)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +205,7 @@ def test_two_windows_joined_are_the_episode_in_one_go(
 
 def test_reading_noise_is_drawn_anew_for_every_step_and_robot(fleet: Fleet, params: Any) -> None:
     """Robots with a network of zeros stand still: what changes in their readings is noise."""
-    noisy = small_room(range_noise=0.2)
+    noisy = small_room(LENGTH, range_noise=0.2)
     still = jax.tree.map(jnp.zeros_like, params)
     epsilon = jnp.zeros(ROBOTS)
     episodes, trace = drive(

@@ -27,6 +27,7 @@ from sqn_jax.env.params import EnvParams, EnvState, Observation
 from sqn_jax.env.raycast import cast_rays
 
 NUM_ACTIONS = 5
+STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
 ACTION_NAMES = ("stand still", "forward", "backward", "turn left", "turn right")
 MOTION_ITERATIONS = 12
 """Free rectangles the way of one step may cross; a longer way counts as blocked."""

@@ -3,9 +3,11 @@
 No pyplot, no display, no global state: a figure belongs to nobody until `save` writes it as PNG.
 """
 
-from sqn_jax.figures.comparisons import learning_curves, robustness
+from sqn_jax.figures.curves import learning_curve, learning_curves
 from sqn_jax.figures.gallery import map_gallery
-from sqn_jax.figures.runs import DPI, MAX_PATHS, WIDTH_IN, learning_curve, save, trajectories
+from sqn_jax.figures.noise import robustness
+from sqn_jax.figures.paths import MAX_PATHS, trajectories
+from sqn_jax.figures.style import DPI, WIDTH_IN, save
 
 __all__ = [
     "DPI",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from sqn_jax.figures.runs import COLOURS, DPI, WIDTH_IN
+from sqn_jax.figures.style import COLOURS, DPI, OBSTACLE, WIDTH_IN
 from sqn_jax.maps import OccupancyMap
 
 
@@ -28,7 +28,7 @@ def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
             occupancy_map.occupied,
             origin="lower",
             extent=(0, width_m, 0, height_m),
-            cmap=ListedColormap(["#f7f7f4", "#333a42"]),
+            cmap=ListedColormap(["#f7f7f4", OBSTACLE]),
             interpolation="nearest",
         )
         for number, (x, y) in enumerate(occupancy_map.evaluation_points, start=1):

@@ -1,7 +1,7 @@
 """Maps, on the host: occupancy grids, their files and their distance fields."""
 
 from sqn_jax.maps.check import describe
-from sqn_jax.maps.distance import goal_distance, obstacle_distance
+from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -20,6 +20,7 @@ __all__ = [
     "connected_components",
     "describe",
     "goal_distance",
+    "goal_fields",
     "known_maps",
     "load_map",
     "obstacle_distance",

@@ -6,6 +6,8 @@ Arrays are `[row, col]` with row 0 at the bottom; the centre of a cell is
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
@@ -20,6 +22,8 @@ _HALF_MOVES = (
 # Cells this near to a goal get their straight distance if nothing stands around: close by, the few
 # directions of the grid would be felt most.
 _NEAR_CELLS = 12
+FIELD_CELLS = 8_000_000
+"""Cells of distance fields that `goal_fields` computes at once."""
 
 
 def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -183,3 +187,24 @@ def goal_distance(
     distance = np.full((len(flat_goals), *free.shape), np.inf, dtype=np.float32)
     distance[:, free] = found[:, :count] * resolution
     return distance.reshape(*goals.shape[:-1], *free.shape)
+
+
+def goal_fields(
+    free: NDArray[np.bool_], resolution: float, goals: NDArray[np.floating]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32]]]:
+    """The distance field of each different goal, a few computed at a time to bound the memory.
+
+    Args:
+      free, resolution: as for `goal_distance`.
+      goals: [E, 2] in the grid frame, m; the same one may come many times.
+
+    Yields:
+      Which of the goals [n] are this one, and its `goal_distance` [H, W].
+    """
+    places, which = np.unique(goals, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    at_once = max(1, FIELD_CELLS // free.size)
+    for first in range(0, len(places), at_once):
+        fields = goal_distance(free, resolution, places[first : first + at_once])
+        for number, field in enumerate(fields, first):
+            yield np.flatnonzero(which == number), field

@@ -1,12 +1,8 @@
-"""How one run went: its learning curve, and the paths its robot took."""
+"""The paths that robots took, over the distance fields of their goals."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,155 +14,21 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
-from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from sqn_jax.figures.style import COLOURS, DPI, INK, OBSTACLE, WIDTH_IN
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
 Floats = NDArray[np.float64]
-Rows = Sequence[Mapping[str, Any]]
 
-DPI = 160
-WIDTH_IN = 9.0
 MAX_PATHS = 8  # in one panel; more would hide each other
 
-# Okabe and Ito's colours, told apart under every common colour blindness; no yellow on white.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_OBSTACLE, _UNREACHABLE, _INK, _RED, _YELLOW = "#333a42", "#b9b9b9", "#222222", "#b00020", "#ffd92f"
-_GROUND_MAP = ListedColormap([_UNREACHABLE, _OBSTACLE])
+_UNREACHABLE, _RED, _YELLOW = "#b9b9b9", "#b00020", "#ffd92f"
+_GROUND_MAP = ListedColormap([_UNREACHABLE, OBSTACLE])
 # Few and light shades, so that their steps read as height lines and paths stand out.
 _FIELD_MAP = ListedColormap(np.linspace([0.985, 0.99, 0.975], [0.70, 0.80, 0.82], 12))
 # Dark blue over violet to orange: brightness rises all along, so that it survives greyscale.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.8, 256)))
-
-
-def _metric(rows: Rows, name: str) -> Floats:
-    """A metric as [R, S] (rows, seeds); NaN for None and where a row lacks it."""
-    values = [np.asarray(row.get(name, np.nan), dtype=np.float64) for row in rows]
-    shapes = sorted({value.shape for value in values})
-    if len(shapes) > 1:
-        raise ValueError(f"{name} has the shapes {shapes} in some rows, expected one in all")
-    return np.stack(values).reshape(len(rows), -1)
-
-
-def _draw_curve(
-    axes: Axes, episodes: Floats, values: Floats, colour: str, label: str = "", style: str = "-"
-) -> None:
-    """Draw [R, S]: the mean bold and, if there are several, each seed thin behind it."""
-    # One point makes no line.
-    marker = "o" if len(episodes) == 1 else ""
-    look: dict[str, Any] = {"color": colour, "linestyle": style, "marker": marker}
-    if values.shape[1] > 1:
-        axes.plot(episodes, values, ms=3, lw=0.8, alpha=0.4, **look)
-    # Masked, since nanmean warns of rows without any number.
-    mean = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
-    axes.plot(episodes, mean, ms=5, lw=2.0, label=label, **look)
-
-
-def learning_curve(rows: Rows, *, title: str) -> Figure:
-    """Draw how a run learned: reward, success, loss and use of the skills over its episodes.
-
-    Args:
-        rows: the objects of a run's `metrics.jsonl`, one a chunk. `episodes` (cumulative) is
-            needed; `mean_reward`, `success`, `loss`, `epsilon`, `gate_entropy` (nat) and
-            `wall_seconds` are drawn where present. Each is a number or a list with one a training
-            seed: then every seed is a thin line and their mean a bold one. `skill_usage` is [K],
-            or [seeds, K]. NaN and None leave a gap.
-        title: stands above all panels.
-
-    Returns:
-        Three panels, or four if there is more than one skill.
-
-    Raises:
-        ValueError: no rows, rows without `episodes`, or a metric whose shape changes.
-    """
-    if not rows or any("episodes" not in row for row in rows):
-        raise ValueError(f"{len(rows)} rows of metrics, expected at least one, all with episodes")
-    episodes = _metric(rows, "episodes").max(axis=1)
-    skills = np.shape(rows[0].get("skill_usage", [1.0]))[-1]
-    figure = Figure(figsize=(WIDTH_IN, 6.4 if skills > 1 else 3.7), dpi=DPI, layout="constrained")
-    lines, columns = (2, 2) if skills > 1 else (1, 3)
-    panels = list(figure.subplots(lines, columns, sharex=True).flat)
-    panels[0].set_title("mean reward a step", fontsize=11)
-    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLOURS[0])
-    _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
-    _draw_loss(panels[2], episodes, _metric(rows, "loss"))
-    if skills > 1:
-        usage = _metric(rows, "skill_usage").reshape(len(rows), -1, skills)
-        _draw_skills(panels[3], episodes, usage, _metric(rows, "gate_entropy"))
-    wall_seconds = _metric(rows, "wall_seconds").max(axis=1)
-    for number, axes in enumerate(panels):
-        axes.grid(color="0.9")
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_xlim(0, 1.02 * max(1.0, episodes.max()))
-        axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        if number < columns:
-            _add_minutes(axes, episodes, wall_seconds)
-        if number >= len(panels) - columns:
-            axes.set_xlabel("training episodes")
-    seeds = _metric(rows, "mean_reward").shape[1]
-    suffix = f" (thin: {seeds} seeds, bold: their mean)" if seeds > 1 else ""
-    figure.suptitle(title + suffix, fontsize=13)
-    return figure
-
-
-def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
-    """Success, with the share of random actions that it suffers from."""
-    axes.set_title("success under exploration noise", fontsize=11)
-    _draw_curve(axes, episodes, success, COLOURS[2], "success")
-    if np.isfinite(epsilon).any():
-        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
-    _finish_shares(axes)
-
-
-def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
-    axes.set_title("loss", fontsize=11)
-    _draw_curve(axes, episodes, loss, COLOURS[1])
-    if not np.isfinite(loss).any():
-        axes.text(0.5, 0.5, "no update yet", transform=axes.transAxes, ha="center", color="0.4")
-        axes.set_yticks([])
-    elif (loss[np.isfinite(loss)] > 0).all():
-        axes.set_yscale("log")
-
-
-def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -> None:
-    """Mean weight of each skill [R, S, K], and the entropy [R, S] as a share of its maximum."""
-    axes.set_title("weight of the skills", fontsize=11)
-    skills = usage.shape[2]
-    for skill in range(skills):
-        colour = COLOURS[skill % len(COLOURS)]
-        _draw_curve(axes, episodes, usage[..., skill], colour, f"skill {skill + 1}")
-    if np.isfinite(entropy).any():
-        share = entropy / math.log(skills)
-        _draw_curve(axes, episodes, share, _INK, f"gate entropy / log {skills}", ":")
-    _finish_shares(axes)
-
-
-def _finish_shares(axes: Axes) -> None:
-    """A scale from 0 to 1, with room above it for the legend."""
-    entries = len(axes.get_legend_handles_labels()[0])
-    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(entries / 3))
-    axes.set_yticks(np.linspace(0, 1, 6))
-    axes.legend(fontsize=9, loc="upper center", ncols=3, columnspacing=1.2, frameon=False)
-
-
-def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
-    """A second scale at the top: minutes of wall-clock time, where the rows know it."""
-    known = np.isfinite(wall_seconds)
-    if not known.any():
-        return
-    # A resumed run may start its clock anew; a scale must not turn back.
-    minutes = np.maximum.accumulate(wall_seconds[known]) / 60
-    ticks: Any = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(minutes[0], minutes[-1])
-    ticks = ticks[(ticks >= minutes[0]) & (ticks <= minutes[-1])]
-    if ticks.size < 2:
-        ticks = minutes[-1:]
-    places = np.interp(ticks, minutes, episodes[known])
-    top = axes.secondary_xaxis("top")
-    top.set_xticks(places, [f"{tick:.3g}" for tick in ticks], fontsize=9)
-    top.tick_params(color="0.5", labelcolor="0.35")
-    top.set_xlabel("minutes", fontsize=9, color="0.35")
 
 
 class _Panel(NamedTuple):
@@ -344,7 +206,7 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
     else:
         lines.set(array=weights, cmap=_WEIGHT_MAP, norm=Normalize(0.0, 1.0))
     axes.add_collection(lines, autolim=False)
-    axes.plot(*points[0], "o", ms=6, mfc="white", mec=_INK, mew=1.3, zorder=5)
+    axes.plot(*points[0], "o", ms=6, mfc="white", mec=INK, mew=1.3, zorder=5)
     if not reached:
         cross = axes.plot(*points[-1], "x", ms=9, mec=_RED, mew=2.5, zorder=6)[0]
         cross.set_path_effects([patheffects.withStroke(linewidth=4.5, foreground="white")])
@@ -352,8 +214,8 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
 
 def _draw_goal(axes: Axes, panel: _Panel, steps: NDArray[Any], goal_radius: float) -> None:
     """The goal, and above the panel how many reached it, in how many steps on average."""
-    axes.add_patch(Circle(panel.goal, goal_radius, fill=False, ec=_INK, lw=1.2, zorder=4))
-    axes.plot(*panel.goal, "*", ms=11, mfc=_YELLOW, mec=_INK, mew=1.0, zorder=7)
+    axes.add_patch(Circle(panel.goal, goal_radius, fill=False, ec=INK, lw=1.2, zorder=4))
+    axes.plot(*panel.goal, "*", ms=11, mfc=_YELLOW, mec=INK, mew=1.0, zorder=7)
     mean = f", {steps[panel.reached].mean():.0f} steps" if panel.reached.size else ""
     where = f"goal ({panel.goal[0]:.1f}, {panel.goal[1]:.1f}) m"
     axes.set_title(f"{where}: {panel.reached.size} of {panel.total} reached{mean}", fontsize=10)
@@ -361,36 +223,14 @@ def _draw_goal(axes: Axes, panel: _Panel, steps: NDArray[Any], goal_radius: floa
 
 def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> None:
     """What the marks mean, below the panels."""
-    marks = [("start", "o", 6, "white", _INK), ("goal", "*", 11, _YELLOW, _INK)]
-    marks.append((f"goal radius {goal_radius:g} m", "o", 10, "none", _INK))
+    marks = [("start", "o", 6, "white", INK), ("goal", "*", 11, _YELLOW, INK)]
+    marks.append((f"goal radius {goal_radius:g} m", "o", 10, "none", INK))
     if any_failure:
         marks.append(("not reached", "x", 9, "none", _RED))
     handles: list[Line2D | Patch] = [
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
         for label, marker, size, face, edge in marks
     ]
-    handles += [Patch(fc=_OBSTACLE, label="obstacle"), Patch(fc=_UNREACHABLE, label="unreachable")]
+    handles += [Patch(fc=OBSTACLE, label="obstacle"), Patch(fc=_UNREACHABLE, label="unreachable")]
     look: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
     figure.legend(handles=handles, loc="outside lower center", fontsize=9, **look)
-
-
-def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, all or nothing; missing folders are made.
-
-    Raises:
-        ValueError: the name does not end in .png, or the file cannot be written.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise ValueError(f"{path}: the name ends in {path.suffix!r}, expected .png")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Without the software's version, the same figure gives the same file.
-        figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
-        partial.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()

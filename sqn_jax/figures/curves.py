@@ -1,0 +1,193 @@
+"""How training went: the curves of one run, or of several agents side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+from numpy.typing import NDArray
+
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, tidy
+from sqn_jax.statistics import bootstrap_interval
+
+Floats = NDArray[np.float64]
+Rows = Sequence[Mapping[str, Any]]
+
+
+def _metric(rows: Rows, name: str) -> Floats:
+    """A metric as [R, S] (rows, seeds); NaN for None and where a row lacks it."""
+    values = [np.asarray(row.get(name, np.nan), dtype=np.float64) for row in rows]
+    shapes = sorted({value.shape for value in values})
+    if len(shapes) > 1:
+        raise ValueError(f"{name} has the shapes {shapes} in some rows, expected one in all")
+    return np.stack(values).reshape(len(rows), -1)
+
+
+def _draw_curve(
+    axes: Axes, episodes: Floats, values: Floats, colour: str, label: str = "", style: str = "-"
+) -> None:
+    """Draw [R, S]: the mean bold and, if there are several, each seed thin behind it."""
+    # One point makes no line.
+    marker = "o" if len(episodes) == 1 else ""
+    look: dict[str, Any] = {"color": colour, "linestyle": style, "marker": marker}
+    if values.shape[1] > 1:
+        axes.plot(episodes, values, ms=3, lw=0.8, alpha=0.4, **look)
+    # Masked, since nanmean warns of rows without any number.
+    mean = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
+    axes.plot(episodes, mean, ms=5, lw=2.0, label=label, **look)
+
+
+def learning_curve(rows: Rows, *, title: str) -> Figure:
+    """Draw how a run learned: reward, success, loss and use of the skills over its episodes.
+
+    Args:
+        rows: the objects of a run's `metrics.jsonl`, one a chunk. `episodes` (cumulative) is
+            needed; `mean_reward`, `success`, `loss`, `epsilon`, `gate_entropy` (nat) and
+            `wall_seconds` are drawn where present. Each is a number or a list with one a training
+            seed: then every seed is a thin line and their mean a bold one. `skill_usage` is [K],
+            or [seeds, K]. NaN and None leave a gap.
+        title: stands above all panels.
+
+    Returns:
+        Three panels, or four if there is more than one skill.
+
+    Raises:
+        ValueError: no rows, rows without `episodes`, or a metric whose shape changes.
+    """
+    if not rows or any("episodes" not in row for row in rows):
+        raise ValueError(f"{len(rows)} rows of metrics, expected at least one, all with episodes")
+    episodes = _metric(rows, "episodes").max(axis=1)
+    skills = np.shape(rows[0].get("skill_usage", [1.0]))[-1]
+    figure = Figure(figsize=(WIDTH_IN, 6.4 if skills > 1 else 3.7), dpi=DPI, layout="constrained")
+    lines, columns = (2, 2) if skills > 1 else (1, 3)
+    panels = list(figure.subplots(lines, columns, sharex=True).flat)
+    panels[0].set_title("mean reward a step", fontsize=11)
+    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLOURS[0])
+    _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
+    _draw_loss(panels[2], episodes, _metric(rows, "loss"))
+    if skills > 1:
+        usage = _metric(rows, "skill_usage").reshape(len(rows), -1, skills)
+        _draw_skills(panels[3], episodes, usage, _metric(rows, "gate_entropy"))
+    wall_seconds = _metric(rows, "wall_seconds").max(axis=1)
+    for number, axes in enumerate(panels):
+        tidy(axes)
+        axes.set_xlim(0, 1.02 * max(1.0, episodes.max()))
+        axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if number < columns:
+            _add_minutes(axes, episodes, wall_seconds)
+        if number >= len(panels) - columns:
+            axes.set_xlabel("training episodes")
+    seeds = _metric(rows, "mean_reward").shape[1]
+    suffix = f" (thin: {seeds} seeds, bold: their mean)" if seeds > 1 else ""
+    figure.suptitle(title + suffix, fontsize=13)
+    return figure
+
+
+def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
+    """Success, with the share of random actions that it suffers from."""
+    axes.set_title("success under exploration noise", fontsize=11)
+    _draw_curve(axes, episodes, success, COLOURS[2], "success")
+    if np.isfinite(epsilon).any():
+        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
+    _finish_shares(axes)
+
+
+def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
+    axes.set_title("loss", fontsize=11)
+    _draw_curve(axes, episodes, loss, COLOURS[1])
+    if not np.isfinite(loss).any():
+        axes.text(0.5, 0.5, "no update yet", transform=axes.transAxes, ha="center", color="0.4")
+        axes.set_yticks([])
+    elif (loss[np.isfinite(loss)] > 0).all():
+        axes.set_yscale("log")
+
+
+def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -> None:
+    """Mean weight of each skill [R, S, K], and the entropy [R, S] as a share of its maximum."""
+    axes.set_title("weight of the skills", fontsize=11)
+    skills = usage.shape[2]
+    for skill in range(skills):
+        colour = COLOURS[skill % len(COLOURS)]
+        _draw_curve(axes, episodes, usage[..., skill], colour, f"skill {skill + 1}")
+    if np.isfinite(entropy).any():
+        share = entropy / math.log(skills)
+        _draw_curve(axes, episodes, share, INK, f"gate entropy / log {skills}", ":")
+    _finish_shares(axes)
+
+
+def _finish_shares(axes: Axes) -> None:
+    """A scale from 0 to 1, with room above it for the legend."""
+    entries = len(axes.get_legend_handles_labels()[0])
+    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(entries / 3))
+    axes.set_yticks(np.linspace(0, 1, 6))
+    axes.legend(fontsize=9, loc="upper center", ncols=3, columnspacing=1.2, frameon=False)
+
+
+def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
+    """A second scale at the top: minutes of wall-clock time, where the rows know it."""
+    known = np.isfinite(wall_seconds)
+    if not known.any():
+        return
+    # A resumed run may start its clock anew; a scale must not turn back.
+    minutes = np.maximum.accumulate(wall_seconds[known]) / 60
+    ticks: Any = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(minutes[0], minutes[-1])
+    ticks = ticks[(ticks >= minutes[0]) & (ticks <= minutes[-1])]
+    if ticks.size < 2:
+        ticks = minutes[-1:]
+    places = np.interp(ticks, minutes, episodes[known])
+    top = axes.secondary_xaxis("top")
+    top.set_xticks(places, [f"{tick:.3g}" for tick in ticks], fontsize=9)
+    top.tick_params(color="0.5", labelcolor="0.35")
+    top.set_xlabel("minutes", fontsize=9, color="0.35")
+
+
+def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure:
+    """Mean reward and success of training over the episodes, one line an agent.
+
+    Args:
+        runs: for each agent the `metrics.jsonl` rows of its runs; `mean_reward` and `success` are
+            numbers, or lists with one a training seed. Runs of an agent are cut to the shortest.
+        title: stands above both panels.
+
+    Returns:
+        Two panels. The line is the mean over an agent's training seeds, the band a 95 % bootstrap
+        interval of it; with one seed there is no band.
+
+    Raises:
+        ValueError: an agent has no rows.
+    """
+    figure = Figure(figsize=(WIDTH_IN, 3.6), dpi=DPI, layout="constrained")
+    panels = figure.subplots(1, 2)
+    for number, (agent, rows_of_runs) in enumerate(runs.items()):
+        if not rows_of_runs or not all(rows_of_runs):
+            raise ValueError(f"agent {agent}: no rows of metrics, expected at least one a run")
+        length = min(len(rows) for rows in rows_of_runs)
+        episodes = np.array([row["episodes"] for row in rows_of_runs[0][:length]], float)
+        for axes, name in zip(panels, ("mean_reward", "success"), strict=True):
+            values = np.concatenate([_metric(rows[:length], name) for rows in rows_of_runs], axis=1)
+            _draw_band(axes, episodes, values, COLOURS[number % len(COLOURS)], agent)
+    for axes, name in zip(panels, ("mean reward a step", "success while training"), strict=True):
+        axes.set_title(name, fontsize=11)
+        axes.set_xlabel("episodes")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        tidy(axes)
+    panels[1].set_ylim(0, 1.02)
+    panels[0].legend(frameon=False)
+    figure.suptitle(title)
+    return figure
+
+
+def _draw_band(
+    axes: Axes, episodes: NDArray[Any], values: NDArray[Any], colour: str, label: str
+) -> None:
+    """Mean of values [R, S] over the seeds, and its interval where there are several."""
+    axes.plot(episodes, values.mean(axis=1), color=colour, lw=2, label=label)
+    if values.shape[1] > 1:
+        low, high = np.array([bootstrap_interval(row, resamples=400) for row in values]).T
+        axes.fill_between(episodes, low, high, color=colour, alpha=0.2, lw=0)

@@ -1,0 +1,69 @@
+"""Success under noise, several agents side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sqn_jax.figures.style import COLOURS, DPI, WIDTH_IN, tidy
+
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+
+
+def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
+    """Success over velocity noise and over range noise, one line an agent.
+
+    Args:
+        results: entries of an evaluation file on one map, for one goal radius, each with one of
+            the two noises at 0.
+        title: stands above both panels.
+
+    Returns:
+        Two panels; the bars are the entries' 95 % intervals over episodes.
+
+    Raises:
+        ValueError: there are no entries.
+    """
+    if not results:
+        raise ValueError("no results, expected at least one entry")
+    figure = Figure(figsize=(WIDTH_IN, 3.6), dpi=DPI, layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    agents = list(dict.fromkeys(entry["agent"] for entry in results))
+    for axes, noise, other in (
+        (panels[0], "velocity_noise", "range_noise"),
+        (panels[1], "range_noise", "velocity_noise"),
+    ):
+        for number, agent in enumerate(agents):
+            entries = [e for e in results if e["agent"] == agent and e[other] == 0]
+            entries = sorted(entries, key=lambda entry: entry[noise])
+            success = [entry["success"] for entry in entries]
+            mean = np.array([told["mean"] for told in success])
+            low, high = np.array([told["ci95"] for told in success]).T
+            axes.errorbar(
+                [entry[noise] for entry in entries],
+                mean,
+                yerr=[np.maximum(mean - low, 0), np.maximum(high - mean, 0)],
+                color=COLOURS[number % len(COLOURS)],
+                marker=_MARKERS[number % len(_MARKERS)],
+                capsize=3,
+                label=agent,
+            )
+        unit = results[0][f"{noise}_unit"]
+        axes.set_xlabel(_NOISE_LABELS[noise, unit])
+        tidy(axes)
+    panels[0].set_ylabel("success")
+    panels[0].set_ylim(0, 1.02)
+    panels[0].legend(frameon=False)
+    figure.suptitle(title)
+    return figure
+
+
+_NOISE_LABELS = {
+    ("velocity_noise", "relative"): "velocity noise, sigma as a share of full speed",
+    ("velocity_noise", "absolute"): "velocity noise, sigma in m/s and rad/s",
+    ("range_noise", "relative"): "range noise, half-width as a share of the reading",
+    ("range_noise", "absolute"): "range noise, half-width as a share of the range",
+}

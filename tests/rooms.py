@@ -1,0 +1,41 @@
+"""A small room, and weights that make robots do different things in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sqn_jax.agent import initial_carry
+from sqn_jax.agent.networks import QNetwork
+from sqn_jax.config import EnvConfig
+from sqn_jax.env import EnvParams, make_env
+from sqn_jax.maps import OccupancyMap
+from sqn_jax.rollout import start_fleet
+
+
+def small_room(length: int, **changes: Any) -> EnvParams:
+    """3 x 4 m, not square, with a wall in the middle and spawn points in its corners.
+
+    Episodes take `length` steps; changes are to `EnvConfig`.
+    """
+    occupied = np.zeros((30, 40), dtype=bool)
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    occupied[14:16, 12:28] = True
+    corners = np.array([[0.65, 0.65], [3.35, 0.65], [0.65, 2.35], [3.35, 2.35]])
+    room = OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=length)
+    return make_env(room, EnvConfig(**changes))
+
+
+def random_params(network: QNetwork, env_params: EnvParams, seed: int = 0) -> Any:
+    """Weights large enough that greedy robots do different things."""
+
+    def initial(key: jax.Array) -> Any:
+        obs = jax.tree.map(lambda x: x[None], start_fleet(key, 1, network, env_params).obs)
+        return network.init(key, obs, initial_carry(network.config, 1))
+
+    shapes = jax.eval_shape(initial, jax.random.key(0))
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
