@@ -15,14 +15,15 @@ from matplotlib.patches import Circle
 from PIL import Image
 
 from sqn_jax import figures
-from sqn_jax.figures import curves, paths, style
+from sqn_jax.figures import curves, style
+from sqn_jax.figures import paths as paths_module
 from sqn_jax.maps import OccupancyMap
 
 FULL_DPI = figures.DPI
 
 
 def set_dpi(monkeypatch, dpi):
-    for module in (curves, paths, style):
+    for module in (curves, paths_module, style):
         monkeypatch.setattr(module, "DPI", dpi)
 
 
