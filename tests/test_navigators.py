@@ -13,14 +13,16 @@ import pytest
 
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.bug import BugNavigator
+from sqn_jax.compare import World, shortest_ways
 from sqn_jax.config import EnvConfig, NetworkConfig
-from sqn_jax.env import EnvParams, make_env, reset
+from sqn_jax.env import EnvParams, make_env, reset, reset_to, step
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluate import episode_keys, run_episodes
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
 from sqn_jax.navigators import BeamSearch, Oracle, drive, run_bug, run_oracle
 from sqn_jax.planners import HEADINGS, Ways, oracle_steps
+from sqn_jax.statistics import success_weighted_path_length
 
 KEY = jax.random.key(11)
 
@@ -100,8 +102,8 @@ def test_oracle_reaches_every_goal_of_the_maze_without_a_collision(maze_episodes
 
 def test_oracle_stands_still_at_the_goal(maze_episodes: Any) -> None:
     summary, trace = maze_episodes
-    for robot, step in enumerate(summary.time_steps):
-        rest = trace.poses[step:, robot]
+    for robot, arrival in enumerate(summary.time_steps):
+        rest = trace.poses[arrival:, robot]
         assert (rest == rest[0]).all()
 
 
@@ -140,6 +142,49 @@ def test_oracle_drives_all_evaluation_pairs_of_the_maze(
     }
     assert len(pairs) == 12
     assert summary.success.all()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "column",
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("maze", "forest", "cave")),
+    ],
+)
+def test_oracle_reaches_a_goal_from_every_point_of_a_map(name: str) -> None:
+    """From every spawn point and evaluation point, by ways hardly longer than the shortest."""
+    occupancy_map = load_map(name)
+    world = make_env(occupancy_map)
+    points = np.concatenate([occupancy_map.evaluation_points, occupancy_map.spawn_points])
+    count = len(points)
+    rng = np.random.default_rng(0)
+    goals = np.array([rng.permutation(points[away(points, here)])[0] for here in points])
+    headings = rng.uniform(-np.pi, np.pi, (count, 1))
+    poses = np.concatenate([points, headings], axis=1)
+    keys = jax.random.split(KEY, count)
+    _, state = jax.vmap(reset_to, in_axes=(0, 0, 0, None))(
+        keys, jnp.asarray(poses, jnp.float32), jnp.asarray(goals, jnp.float32), world
+    )
+    oracle = Oracle(occupancy_map, world, np.asarray(state.goal, np.float64))
+    take = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, None)))
+    arrived, length = np.zeros(count, dtype=bool), np.zeros(count)
+    for _ in range(world.max_steps):
+        actions = jnp.asarray(oracle.choose(np.asarray(state.pose, np.float64)), jnp.int32)
+        before = np.asarray(state.pose)
+        _, state, _, _, _, info = take(keys, state, actions, world)
+        moved = np.hypot(*(np.asarray(state.pose) - before)[:, :2].T)
+        length += np.where(arrived, 0, moved)
+        arrived |= np.asarray(info["reached"])
+        if arrived.all():
+            break
+    assert arrived.all(), points[~arrived]
+    ways = shortest_ways(World(occupancy_map, world, "random pairs", (0.0, 0.0)), poses, goals)
+    assert success_weighted_path_length(arrived, length, ways).mean() > 0.98
+
+
+def away(points: np.ndarray, here: np.ndarray) -> np.ndarray:
+    """Which points are no goal that is reached at the start."""
+    return np.hypot(*(points - here).T) > 0.6
 
 
 def test_what_the_plan_allows_the_simulator_grants(maze: tuple[OccupancyMap, EnvParams]) -> None:
