@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import dataclasses
 import io
+import os
 import re
 import sys
 import time
@@ -41,6 +42,16 @@ USAGE = """usage: sqn COMMAND [OPTIONS]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _dispatch(words)
+        sys.stdout.flush()
+    except BrokenPipeError:  # Whoever read along, say `head`, has enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    return code
+
+
+def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(USAGE, end="")
         return 0 if words else 2
@@ -51,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             return command(words[1:])
+    except SystemExit as stop:  # After a help text.
+        return int(stop.code or 0)
     except ValueError as error:
         return _refuse(str(error))
 
@@ -74,7 +87,7 @@ class _Parser(argparse.ArgumentParser):
 def _train(words: list[str]) -> int:
     parser = _Parser(prog="sqn train", add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", choices=list(PRESETS))
-    parser.add_argument("--run-dir", "--run_dir", type=Path)
+    parser.add_argument("--run-dir", "--run_dir", type=_folder)
     parser.add_argument("--resume", action="store_true")
     own, others = parser.parse_known_args(words)
     if own.resume:
@@ -93,6 +106,12 @@ def _train(words: list[str]) -> int:
     config = _parse_config(others, preset)
     run_dir = own.run_dir or _default_run_dir(config, preset)
     return _run_training(config, run_dir, resume=False)
+
+
+def _folder(word: str) -> Path:
+    if not word.strip():
+        raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
+    return Path(word)
 
 
 def _parse_config(words: list[str], preset: str) -> TrainConfig:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,7 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
         (["train", "--env.max-range", "-1"], ["env.max_range", "-1", "positive"]),
         (["train", "--algo", "ppo"], ["algo", "ppo", "sqn"]),
         (["train", "--resume"], ["--resume", "--run-dir"]),
+        (["train", "--run-dir", ""], ["--run-dir", "empty"]),
         (["map", "check"], ["file"]),
         (["map", "check", "nowhere"], ["nowhere", "maze"]),
     ],
@@ -49,6 +52,17 @@ def test_wrong_words_are_named_in_one_line(
     told = refused(capsys, words)
     for name in names:
         assert name in told, (name, told)
+
+
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "map check"])
+def test_help_into_a_pipe_that_closes_early_ends_without_a_traceback(command: str) -> None:
+    program = [sys.executable, "-m", "sqn_jax", *command.split(), "--help"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed:
+        done = subprocess.run(program, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=90)
+    assert done.returncode in (0, 1)
+    assert done.stderr == ""
 
 
 def test_an_unusable_run_leaves_nothing_behind(
