@@ -15,7 +15,7 @@ IS_NEW_ENOUGH := 'import sys; sys.exit(sys.version_info < (3, 11))'
 IS_USABLE := 'import sys, pip; sys.exit(sys.version_info < (3, 11))'
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-long lint maps clean
+.PHONY: help train test test-long table robustness lint maps clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -29,6 +29,12 @@ test: $(INSTALLED)  ## run the tests, but for the long ones
 
 test-long: $(INSTALLED)  ## run all tests
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "" $(ARGS)
+
+table: $(INSTALLED)  ## train three agents, compare them on four maps, write the paper's table
+	@$(BIN)/python experiments/table1.py $(ARGS)
+
+robustness: $(INSTALLED)  ## the same agents under noise, with the paper's figure
+	@$(BIN)/python experiments/robustness.py $(ARGS)
 
 lint: $(INSTALLED)  ## check style, format and types
 	@$(BIN)/ruff check .

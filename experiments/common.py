@@ -23,10 +23,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algos", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
     parser.add_argument("--num-seeds", type=int, default=1, help="training seeds (default 1)")
     parser.add_argument("--total-episodes", type=int, help="instead of the preset's")
-    parser.add_argument("--episodes", type=int, default=100, help="under each evaluation seed")
-    parser.add_argument("--eval-seeds", type=int, default=5)
-    parser.add_argument("--runs", type=Path, help="where runs are kept (default runs/PRESET)")
+    parser.add_argument(
+        "--episodes", type=int, help="under each evaluation seed (default 100, smoke 20)"
+    )
+    parser.add_argument("--eval-seeds", type=int, help="evaluation seeds (default 5, smoke 2)")
+    parser.add_argument("--runs", type=Path, help="where runs are kept (default runs/table_PRESET)")
     parser.add_argument("--out", type=Path, help="results folder (default the runs' folder)")
+
+
+def episodes_and_seeds(options: argparse.Namespace) -> dict[str, int]:
+    """How many episodes under how many evaluation seeds, as `compare.Settings` takes it."""
+    episodes, seeds = (20, 2) if options.preset == "smoke" else (100, 5)
+    if options.episodes is not None:
+        episodes = options.episodes
+    if options.eval_seeds is not None:
+        seeds = options.eval_seeds
+    return {"episodes": episodes, "eval_seeds": seeds}
 
 
 def runs_folder(options: argparse.Namespace) -> Path:

@@ -1,6 +1,6 @@
 """The paper's robustness figure: success under velocity noise and range noise.
 
-    python experiments/robustness.py [--preset quick|paper|smoke] [--num-seeds K] [--map maze]
+    .venv/bin/python experiments/robustness.py [--preset quick|paper|smoke] [--num-seeds K]
 
 Uses the runs of table1.py, trains what is missing, and writes robustness.json (with one record an
 episode in robustness.jsonl), robustness.md and robustness.png.
@@ -11,7 +11,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from experiments.common import add_options, run, runs_folder, train_missing
+from experiments.common import (
+    add_options,
+    episodes_and_seeds,
+    run,
+    runs_folder,
+    train_missing,
+)
 from sqn_jax import figures
 from sqn_jax.compare import Settings, group_policies
 from sqn_jax.policies import load_policy
@@ -31,8 +37,7 @@ def main() -> None:
     options = parser.parse_args()
     settings = Settings(
         maps=(options.map,),
-        episodes=options.episodes,
-        eval_seeds=options.eval_seeds,
+        **episodes_and_seeds(options),
         noise=(
             (0.0, 0.0),
             *((level, 0.0) for level in VELOCITY_NOISE),

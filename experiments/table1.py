@@ -1,11 +1,11 @@
 """The paper's table: three agents on four maps, beside the paper's numbers and two references.
 
-    python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
+    .venv/bin/python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
 
 Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
 table1.jsonl), table1.md and learning_curves.png. On two cores: ten minutes and more a quick run,
-an hour or so a paper run, a few minutes in all for smoke, whose robots learn next to nothing: it
-shows that everything works.
+an hour or so a paper run, five minutes or so in all for smoke, whose robots learn next to nothing:
+it shows that everything works.
 """
 
 from __future__ import annotations
@@ -14,7 +14,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from experiments.common import add_options, run, runs_folder, train_missing
+from experiments.common import (
+    add_options,
+    episodes_and_seeds,
+    run,
+    runs_folder,
+    train_missing,
+)
 from sqn_jax import figures
 from sqn_jax.compare import Settings, group_policies, with_references
 from sqn_jax.policies import load_policy
@@ -91,9 +97,7 @@ def main() -> None:
     add_options(parser)
     parser.add_argument("--maps", nargs="+", default=list(PAPER_MAPS))
     options = parser.parse_args()
-    settings = Settings(
-        maps=tuple(options.maps), episodes=options.episodes, eval_seeds=options.eval_seeds
-    )
+    settings = Settings(maps=tuple(options.maps), **episodes_and_seeds(options))
     folders = train_missing(options)
     out: Path = options.out or runs_folder(options)
     out.mkdir(parents=True, exist_ok=True)

@@ -233,7 +233,7 @@ def _evaluate(words: list[str]) -> int:
             f"{told['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
         )
     if options.out is not None:
-        print(f"wrote {options.out}")
+        print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
     return 0
 
 

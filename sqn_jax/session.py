@@ -295,6 +295,10 @@ def _draw(
     return True
 
 
+def _duration(seconds: float) -> str:
+    return f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.1f} s"
+
+
 def _conclude(
     results: list[dict[str, Any]],
     timing: dict[str, float],
@@ -313,7 +317,7 @@ def _conclude(
         "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
     }
     print(
-        f"trained in {summary['wall_seconds'] / 60:.1f} min "
+        f"trained in {_duration(summary['wall_seconds'])} "
         f"({summary['steps_per_second']:,} steps a second)"
     )
     for entry in results:
