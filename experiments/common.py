@@ -31,14 +31,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help="results folder (default the runs' folder)")
 
 
-def episodes_and_seeds(options: argparse.Namespace) -> dict[str, int]:
-    """How many episodes under how many evaluation seeds, as `compare.Settings` takes it."""
+def episodes_and_seeds(options: argparse.Namespace) -> tuple[int, int]:
+    """How many episodes under how many evaluation seeds."""
     episodes, seeds = (20, 2) if options.preset == "smoke" else (100, 5)
     if options.episodes is not None:
         episodes = options.episodes
     if options.eval_seeds is not None:
         seeds = options.eval_seeds
-    return {"episodes": episodes, "eval_seeds": seeds}
+    return episodes, seeds
 
 
 def runs_folder(options: argparse.Namespace) -> Path:
@@ -55,6 +55,8 @@ def train_missing(options: argparse.Namespace) -> list[Path]:
     Raises:
         ValueError: a folder holds a run with other settings.
     """
+    if options.num_seeds < 1:
+        raise ValueError(f"--num-seeds is {options.num_seeds}, expected at least 1")
     folders = []
     for algo in options.algos:
         for seed in range(options.num_seeds):

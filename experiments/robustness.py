@@ -19,7 +19,7 @@ from experiments.common import (
     train_missing,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies
+from sqn_jax.compare import Settings, group_policies, load_maps, with_references
 from sqn_jax.policies import load_policy
 from sqn_jax.scores import results_table
 from sqn_jax.session import evaluate_session
@@ -35,9 +35,11 @@ def main() -> None:
     parser.add_argument("--map", default="maze")
     parser.add_argument("--noise-unit", choices=["relative", "absolute"], default="relative")
     options = parser.parse_args()
+    episodes, eval_seeds = episodes_and_seeds(options)
     settings = Settings(
         maps=(options.map,),
-        **episodes_and_seeds(options),
+        episodes=episodes,
+        eval_seeds=eval_seeds,
         noise=(
             (0.0, 0.0),
             *((level, 0.0) for level in VELOCITY_NOISE),
@@ -45,9 +47,11 @@ def main() -> None:
         ),
         noise_unit=options.noise_unit,
     )
-    folders = train_missing(options)
+    # What would be refused later is refused before hours of training.
+    load_maps(with_references([], references=True), settings)
     out: Path = options.out or runs_folder(options)
     out.mkdir(parents=True, exist_ok=True)
+    folders = train_missing(options)
     agents = group_policies([load_policy(folder) for folder in folders])
     evaluation = evaluate_session(list(agents), settings, out / "robustness.json")
     radius = settings.goal_radii[0]

@@ -22,7 +22,7 @@ from experiments.common import (
     train_missing,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies, with_references
+from sqn_jax.compare import Settings, group_policies, load_maps, with_references
 from sqn_jax.policies import load_policy
 from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.runlog import RunFolder
@@ -97,10 +97,13 @@ def main() -> None:
     add_options(parser)
     parser.add_argument("--maps", nargs="+", default=list(PAPER_MAPS))
     options = parser.parse_args()
-    settings = Settings(maps=tuple(options.maps), **episodes_and_seeds(options))
-    folders = train_missing(options)
+    episodes, eval_seeds = episodes_and_seeds(options)
+    settings = Settings(maps=tuple(options.maps), episodes=episodes, eval_seeds=eval_seeds)
+    # What would be refused later is refused before hours of training.
+    load_maps(with_references([], references=True), settings)
     out: Path = options.out or runs_folder(options)
     out.mkdir(parents=True, exist_ok=True)
+    folders = train_missing(options)
     curves: dict[str, list[Any]] = {}
     for folder in folders:
         run_folder, config = RunFolder.open(folder)

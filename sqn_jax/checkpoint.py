@@ -78,9 +78,13 @@ class Checkpoints:
     def _restored(self, step: int, items: dict[str, Any]) -> Any:
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**items))
-        except (ValueError, KeyError, OSError) as error:
+        except Exception as error:  # Orbax raises bare exceptions, too.
             place = self._manager.directory / str(step)
-            raise ValueError(f"checkpoint {place}: cannot be read ({error})") from None
+            told = " ".join(str(error).split())[:200]
+            raise ValueError(
+                f"checkpoint {place}: damaged, or of another network than the run's config.json "
+                f"says ({type(error).__name__}: {told})"
+            ) from None
 
     def _require_step(self) -> int:
         step = self._manager.latest_step()

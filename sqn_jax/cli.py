@@ -15,6 +15,7 @@ import io
 import os
 import re
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -237,11 +238,22 @@ def _evaluate(words: list[str]) -> int:
     return 0
 
 
+RUN_FILES = ("config.json", "summary.json", "evaluation.json", "metrics.json")
+
+
 def _require_writable(path: Path) -> None:
     if path.suffix != ".json":
         raise ValueError(f"--out is {path}, expected a file ending in .json")
-    if not path.parent.is_dir() or path.is_dir():
+    records = path.with_suffix(".jsonl")
+    if not path.parent.is_dir() or path.is_dir() or records.is_dir():
         raise ValueError(f"--out {path}: expected a file in an existing folder")
+    if (path.parent / "config.json").is_file() and path.name in RUN_FILES:
+        raise ValueError(f"--out {path}: is a file of that run itself, expected another name")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
 
 
 def _map(words: list[str]) -> int:

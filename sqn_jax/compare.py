@@ -32,6 +32,9 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
 }
 """The two kinds of tasks, and the spawn mode that draws them."""
 
+MOST_EPISODES, MOST_STEPS = 100_000, 100_000
+"""Under one evaluation seed, and an episode: more would not fit into memory."""
+
 Driven = tuple[list[EpisodeSummary], Trace]
 """A summary for each goal radius, and the trace."""
 Maps = Mapping[tuple[str, float], OccupancyMap]
@@ -63,19 +66,29 @@ class Settings:
     """Steps an episode; 0 for each map's own limit."""
 
     def __post_init__(self) -> None:
-        for name in ("episodes", "eval_seeds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least 1")
-        if self.max_steps < 0:
-            raise ValueError(f"max_steps is {self.max_steps}, expected 0 or a positive number")
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed is {self.seed}, expected a number from 0 to 2147483647")
+        for name, limit in (("episodes", MOST_EPISODES), ("eval_seeds", 10_000)):
+            if not 1 <= getattr(self, name) <= limit:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, expected at least 1 and at most {limit:,}"
+                )
+        if not 0 <= self.max_steps <= MOST_STEPS:
+            raise ValueError(f"max_steps is {self.max_steps}, expected 0 to {MOST_STEPS:,}")
+        if not 0 <= self.seed <= 2**31 - self.eval_seeds:
+            raise ValueError(
+                f"seed is {self.seed}, expected 0 to {2**31 - self.eval_seeds} for "
+                f"{self.eval_seeds} evaluation seeds"
+            )
         for level in (level for pair in self.noise for level in pair):
-            if not 0 <= level < float("inf"):
-                raise ValueError(f"noise is {level}, expected 0 or a positive number")
+            if not 0 <= level <= 1e6:
+                raise ValueError(f"noise is {level}, expected 0 to 1000000")
         for radius in self.goal_radii:
-            if not 0 < radius < float("inf"):
-                raise ValueError(f"goal radius is {radius}, expected a positive number")
+            if not 1e-6 <= radius <= 1e6:
+                raise ValueError(f"goal radius is {radius}, expected 0.000001 to 1000000 m")
+        for name in ("maps", "tasks", "noise", "goal_radii"):
+            given = getattr(self, name)
+            for one in given:
+                if given.count(one) > 1:
+                    raise ValueError(f"{name}: {one} comes twice, expected each once")
         if not (self.maps and self.tasks and self.noise and self.goal_radii):
             raise ValueError("nothing to evaluate: expected a map, a task and a goal radius")
 
@@ -221,11 +234,19 @@ def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
         ValueError: a map is unusable for a robot.
     """
     radii = dict.fromkeys(agent.env_config.robot_radius for agent in agents)
-    return {
+    maps = {
         (name, radius): load_map(name, robot_radius=radius)
         for name in settings.maps
         for radius in radii
     }
+    called: dict[str, str] = {}
+    for (name, _), occupancy_map in maps.items():
+        if called.setdefault(occupancy_map.name, name) != name:
+            raise ValueError(
+                f"maps {called[occupancy_map.name]} and {name}: both are called "
+                f"{occupancy_map.name!r}, the results could not be told apart"
+            )
+    return maps
 
 
 def evaluate_agents(

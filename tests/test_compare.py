@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -39,6 +41,7 @@ from sqn_jax.policies import Policy, load_policy
 TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4", "--num-seeds", "2"]
 AS_TRAINED = ["--maps", "maze", "--max-steps", "30"]
 EPISODES, EVAL_SEEDS = 3, 2
+MAZE_FILE = Path(__file__).resolve().parents[1] / "maps" / "maze.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -208,6 +211,23 @@ def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
         else:
             (broken / name).write_text(text)
         assert name in refusal([str(broken)])
+    out = tmp_path / "0" / "config.json"
+    assert "config.json: is a file of that run" in refusal([str(run_dir), "--out", str(out)])
+
+
+def test_a_damaged_array_of_a_checkpoint_is_one_line(run_dir: Path, tmp_path: Path) -> None:
+    """In a process of its own: Orbax complains later of what it left running when it failed."""
+    shutil.copytree(run_dir, tmp_path / "run")
+    arrays = (tmp_path / "run" / "checkpoints").rglob("target_params/**/d/*")
+    for file in [file for file in arrays if file.stat().st_size > 10_000]:
+        file.write_bytes(b"")
+    words = ["evaluate", str(tmp_path / "run"), "--maps", "maze", "--episodes", "1"]
+    program = [sys.executable, "-m", "sqn_jax", *words]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    told = [line for line in done.stderr.splitlines() if line.startswith("sqn: ")]
+    assert len(told) == 1
+    assert "damaged" in told[0]
 
 
 def test_a_run_without_a_checkpoint_is_named(
@@ -228,11 +248,19 @@ def test_a_run_without_a_checkpoint_is_named(
         (["--no-references"], ["run folder"]),
         (["nowhere"], ["nowhere", "holds no run"]),
         (["--episodes", "0"], ["episodes", "0", "at least 1"]),
+        (["--episodes", "1000000000000"], ["episodes", "1000000000000", "at most"]),
+        (["--seed", "2147483647", "--eval-seeds", "2"], ["seed", "2147483647"]),
+        (["--maps", "maze", "maze"], ["maps", "maze", "twice"]),
+        (["--maps", "maze", str(MAZE_FILE)], ["maps", "maze.yaml", "both are called 'maze'"]),
+        (["--goal-radius", "0.3", "0.3"], ["goal_radii", "0.3", "twice"]),
+        (["--velocity-noise", "0.1", "0.1"], ["noise", "0.1", "twice"]),
+        (["--velocity-noise", "1e39"], ["noise", "1e+39"]),
         (["--eval-seeds", "0"], ["eval_seeds", "0", "at least 1"]),
         (["--velocity-noise", "-0.1"], ["noise", "-0.1"]),
         (["--range-noise", "nan"], ["noise", "nan"]),
         (["--goal-radius", "0"], ["goal radius", "0"]),
         (["--max-steps", "-1"], ["max_steps", "-1"]),
+        (["--out", "/proc/found.json"], ["--out", "/proc/found.json", "cannot be written"]),
         (["--maps", "nowhere"], ["nowhere", "maze"]),
         (["--out", "found.txt"], ["--out", ".json"]),
         (["--out", "no/such/folder/found.json"], ["--out", "existing folder"]),
