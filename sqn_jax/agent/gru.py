@@ -50,8 +50,25 @@ class GRU(nn.Module):
 def _orthogonal_gates(key: Array, shape: tuple[int, int]) -> Array:
     """One orthogonal matrix for each of the three gates."""
     keys = jax.random.split(key, 3)
-    initializer = nn.initializers.orthogonal()
-    return jnp.concatenate([initializer(gate, (shape[0], shape[0])) for gate in keys], axis=1)
+    return jnp.concatenate([_orthogonal(gate, shape[0]) for gate in keys], axis=1)
+
+
+def _orthogonal(key: Array, size: int) -> Array:
+    """A random orthogonal matrix [size, size]: the columns of a normal one, made orthonormal.
+
+    Gram and Schmidt, each column twice, not the library's QR: jaxlib's batched factorisation waits
+    in a thread of the CPU's pool for other threads of that pool, and several seeds at once on two
+    cores then wait for each other for ever.
+    """
+    normal = jax.random.normal(key, (size, size))
+
+    def add_column(index: Array, columns: Array) -> Array:
+        column = normal[:, index]
+        for _ in range(2):
+            column = column - columns @ (columns.T @ column)
+        return columns.at[:, index].set(column * jax.lax.rsqrt(column @ column))
+
+    return jax.lax.fori_loop(0, size, add_column, jnp.zeros((size, size)))
 
 
 @jax.custom_vjp

@@ -52,6 +52,30 @@ def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDA
     return table
 
 
+def far_sides(rectangles: NDArray[np.uint16]) -> NDArray[np.int16]:
+    """The rectangles as a ray wants them: their far sides, counted from the cell's lower left.
+
+    Args:
+        rectangles: [sectors, H, W] from `free_rectangles`, none longer than 127 cells.
+
+    Returns:
+        [sectors, H, W]; the lower byte is the column of the far side less that of the cell, the
+        upper byte the same for rows, both signed. A blocked cell has its near sides there, so that
+        a ray that has come in gets no farther.
+    """
+    sectors = len(rectangles)
+    middle = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
+    sides = []
+    for length, component in (
+        (rectangles & 255, np.cos(middle)),
+        (rectangles >> 8, np.sin(middle)),
+    ):
+        forward = (component > 0)[:, None, None]
+        length = length.astype(np.int16)
+        sides.append(np.where(forward, length, 1 - length))
+    return (sides[0] & 255) | (sides[1] << 8)
+
+
 class _Sums:
     """Summed-area table of a blocked map, padded with blocked cells beyond the far sides."""
 

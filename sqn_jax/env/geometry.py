@@ -29,17 +29,16 @@ def goal_in_robot_frame(pose: Array, goal: Array) -> tuple[Array, Array]:
 def polynomial_arctan2(y: Array, x: Array) -> Array:
     """Angle of (x, y) in [-pi, pi] to within 2e-5 rad, several times faster than `jnp.arctan2`.
 
-    An odd minimax polynomial on [0, 1] and three reflections; it compiles to vector instructions
-    where the library function does not. Used for the thousand sample points of the coverage.
+    In the first quadrant it is pi/4 + atan((y - x) / (y + x)), where an odd minimax polynomial on
+    [-1, 1] does; two reflections give the rest. It compiles to vector instructions where the
+    library function does not. Used for the two thousand sample points of the coverage.
     """
     abs_x, abs_y = jnp.abs(x), jnp.abs(y)
-    larger = jnp.maximum(abs_x, abs_y)
-    ratio = jnp.minimum(abs_x, abs_y) / jnp.maximum(larger, 1e-9)
+    ratio = (abs_y - abs_x) / (abs_y + abs_x + 1e-12)
     square = ratio * ratio
-    angle = 0.05265332 - square * 0.01172120
-    for coefficient in (-0.11643287, 0.19354346, -0.33262347, 0.99997726):
-        angle = coefficient + square * angle
-    angle = ratio * angle
-    angle = jnp.where(abs_y > abs_x, jnp.pi / 2 - angle, angle)
+    angle = jnp.float32(0.02084478)
+    for coefficient in (-0.08515564, 0.18015879, -0.33030465, 0.99986632):
+        angle = angle * square + coefficient
+    angle = angle * ratio + jnp.pi / 4
     angle = jnp.where(x < 0, jnp.pi - angle, angle)
     return jnp.where(y < 0, -angle, angle)

@@ -18,13 +18,14 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from sqn_jax.env import coverage, reward
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.geometry import goal_in_robot_frame
 from sqn_jax.env.params import EnvParams, EnvState, Observation
-from sqn_jax.env.raycast import cast_rays
+from sqn_jax.env.raycast import cast_fan
 
 NUM_ACTIONS = 5
 STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
@@ -153,11 +154,11 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
 def true_ranges(pose: Array, params: EnvParams) -> Array:
     """Noise-free readings [R] of all beams, m, from the rightmost to the leftmost."""
     half = field_of_view(params) / 2
-    beams = jnp.linspace(-half, half, params.config.num_beams)
-    return cast_rays(
+    beams = np.linspace(-half, half, params.config.num_beams, dtype=np.float32)
+    return cast_fan(
         params.sight,
-        pose[:2],
-        pose[2] + beams,
+        pose,
+        beams,
         max_range=params.config.max_range,
         iterations=params.config.ray_iterations,
     )
@@ -176,4 +177,5 @@ def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> 
         field_of_view=field_of_view(params),
         max_range=params.config.max_range,
         cell=params.config.coverage_cell,
+        always=params.sight.resolution > 0,
     )

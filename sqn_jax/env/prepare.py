@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import coverage
-from sqn_jax.env.free_space import free_rectangles
+from sqn_jax.env.free_space import far_sides, free_rectangles
 from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
@@ -138,7 +138,7 @@ def _velocity_noise(config: EnvConfig) -> Array:
 def _ray_grid(
     blocked: NDArray[np.bool_], resolution: float, sectors: int, reach_m: float
 ) -> RayGrid:
-    reach = min(math.ceil(reach_m / resolution), 250)
+    reach = min(math.ceil(reach_m / resolution), 127)  # What a signed byte holds.
     height, width = blocked.shape
     if sectors * height * width >= 2**31:
         raise ValueError(
@@ -146,7 +146,7 @@ def _ray_grid(
             f"with env.ray_sectors {sectors}"
         )
     return RayGrid(
-        rectangles=jnp.asarray(free_rectangles(blocked, sectors, reach).reshape(-1)),
+        far_sides=jnp.asarray(far_sides(free_rectangles(blocked, sectors, reach)).reshape(-1)),
         resolution=jnp.float32(resolution),
         height=height,
         width=width,

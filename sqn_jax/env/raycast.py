@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
+from numpy.typing import NDArray
 
 
 @struct.dataclass
 class RayGrid:
-    """A map prepared for rays by `free_space.free_rectangles`."""
+    """A map prepared for rays by `free_space.far_sides`."""
 
-    rectangles: Array
-    """[sectors * H * W] uint16, width + 256 * height of the free rectangle, cells."""
+    far_sides: Array
+    """[sectors * H * W] int16, where the free rectangle of a cell ends; 0 in a blocked cell of the
+    first sector."""
     resolution: Array
     """m per cell."""
     height: int = struct.field(pytree_node=False)
@@ -43,14 +46,59 @@ def cast_rays(
     Returns:
         [R] distances in 0..max_range, m.
     """
-    cosines, sines = _nonzero(jnp.cos(angles)), _nonzero(jnp.sin(angles))
+    directions = (angles, jnp.cos(angles), jnp.sin(angles))
+    return _hop(grid, position, directions, max_range, iterations)
+
+
+def cast_fan(
+    grid: RayGrid, pose: Array, beams: NDArray[np.float32], *, max_range: float, iterations: int
+) -> Array:
+    """Distance from a pose [3] to the first blocked cell along beams fixed to the robot.
+
+    The same as `cast_rays` with the angles `pose[2] + beams`, for one sine and one cosine in all:
+    those of many angles take as long as the rays themselves.
+
+    Args:
+        pose: x m, y m, heading rad.
+        beams: [R] directions relative to the heading, rad, known when the program is compiled.
+
+    Returns:
+        [R] distances in 0..max_range, m.
+    """
+    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+    beam_cosines, beam_sines = np.cos(beams), np.sin(beams)
+    directions = (
+        pose[2] + beams,
+        cosine * beam_cosines - sine * beam_sines,
+        sine * beam_cosines + cosine * beam_sines,
+    )
+    return _hop(grid, pose[:2], directions, max_range, iterations)
+
+
+def _hop(
+    grid: RayGrid,
+    position: Array,
+    directions: tuple[Array, Array, Array],
+    max_range: Array | float,
+    iterations: int,
+) -> Array:
+    """Cast rays of the given angles, cosines and sines, [R] each."""
+    angles, cosines, sines = directions
     sector = jnp.floor(angles * (grid.sectors / (2 * jnp.pi))).astype(jnp.int32) % grid.sectors
-    table_start = sector * (grid.height * grid.width)
-    x, y = position[0] / grid.resolution, position[1] / grid.resolution
-    sign_x, sign_y = jnp.sign(cosines), jnp.sign(sines)
-    inverse_x, inverse_y = 1 / cosines, 1 / sines
-    # The near corner of a rectangle, from the cell's lower left: 0 going up, 1 going down.
-    corner_x, corner_y = (sign_x < 0) - x, (sign_y < 0) - y
+    # The sector says which way the table looks: a direction that rounding has put on the other
+    # side of an axis comes back, and one on an axis gets a little aside, where 0 times infinity
+    # would appear.
+    quadrant = sector // (grid.sectors // 4)
+    cosines = _with_sign(cosines, (quadrant == 0) | (quadrant == 3))
+    sines = _with_sign(sines, quadrant < 2)
+    inverse_cosines, inverse_sines = 1 / cosines, 1 / sines
+    # Counted from the corner of the robot's own cell: far from the map's corner, single precision
+    # would not tell the two sides of a border apart.
+    in_cells = position / grid.resolution
+    own_cell = jnp.floor(in_cells)
+    x, y = in_cells - own_cell
+    column, row = own_cell.astype(jnp.int32)
+    table_start = (sector * grid.height + row) * grid.width + column
     limit = max_range / grid.resolution
 
     def hop(_: Array, travelled: Array) -> Array:
@@ -58,11 +106,11 @@ def cast_rays(
         inside = travelled + 1e-3
         column, row = jnp.floor(x + cosines * inside), jnp.floor(y + sines * inside)
         cell = table_start + row.astype(jnp.int32) * grid.width + column.astype(jnp.int32)
-        rectangle = grid.rectangles.at[cell].get(mode="promise_in_bounds").astype(jnp.int32)
-        to_side = (column + corner_x + sign_x * (rectangle & 255)) * inverse_x
-        to_top = (row + corner_y + sign_y * (rectangle >> 8)) * inverse_y
-        farther = jnp.minimum(jnp.minimum(to_side, to_top), limit)
-        return jnp.where(rectangle > 0, farther, travelled)
+        sides = grid.far_sides.at[cell].get(mode="promise_in_bounds").astype(jnp.int32)
+        side_x, side_y = (sides << 24) >> 24, sides >> 8
+        to_side = (column + side_x.astype(jnp.float32) - x) * inverse_cosines
+        to_top = (row + side_y.astype(jnp.float32) - y) * inverse_sines
+        return jnp.maximum(travelled, jnp.minimum(jnp.minimum(to_side, to_top), limit))
 
     start = jnp.zeros_like(cosines)
     return jax.lax.fori_loop(0, iterations, hop, start) * grid.resolution
@@ -72,9 +120,10 @@ def is_blocked(grid: RayGrid, position: Array) -> Array:
     """Whether the cell at a position [2] m is blocked; the position must lie on the map."""
     column, row = jnp.floor(position / grid.resolution).astype(jnp.int32)
     cell = row * grid.width + column
-    return grid.rectangles.at[cell].get(mode="promise_in_bounds") == 0
+    return grid.far_sides.at[cell].get(mode="promise_in_bounds") == 0
 
 
-def _nonzero(component: Array) -> Array:
-    """Keep a direction off the exact axis, where 0 times infinity would appear."""
-    return jnp.where(jnp.abs(component) < 1e-7, 1e-7, component)
+def _with_sign(component: Array, positive: Array) -> Array:
+    """The absolute value of a component of a direction, at least 1e-7, with the sign asked for."""
+    size = jnp.maximum(jnp.abs(component), 1e-7)
+    return jnp.where(positive, size, -size)

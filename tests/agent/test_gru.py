@@ -10,7 +10,7 @@ import pytest
 from jax import Array
 from learning_oracle import projected_gru_step
 
-from sqn_jax.agent.gru import GRU, scan_gru
+from sqn_jax.agent.gru import GRU, _orthogonal, scan_gru
 
 SIZE, BATCH, INPUTS = 3, 2, 4
 ARGUMENTS = ("projected", "carry", "hidden_kernel", "candidate_bias")
@@ -120,12 +120,27 @@ def test_vmapped_derivatives_are_those_of_each_seed_alone() -> None:
             np.testing.assert_allclose(ours[index], theirs, atol=1e-5)
 
 
-def test_each_gate_of_the_recurrent_kernel_starts_orthogonal() -> None:
-    init = jax.jit(GRU(SIZE).init)
-    params = init(jax.random.key(0), jnp.zeros((1, 1, INPUTS)), jnp.zeros((1, SIZE)))
-    kernel = np.asarray(params["params"]["hidden_kernel"])
-    gates = [kernel[:, i * SIZE : (i + 1) * SIZE] for i in range(3)]
+def test_each_gate_starts_orthogonal_as_numpy_s_factorisation_has_it() -> None:
+    size = 128
+    layer = GRU(size)
+    key = jax.random.key(5)
+    kernel = layer.init(key, jnp.zeros((1, 1, 2)), jnp.zeros((1, size)))["params"]["hidden_kernel"]
+    gates = np.split(np.asarray(kernel, np.float64), 3, axis=1)
     for gate in gates:
-        np.testing.assert_allclose(gate.T @ gate, np.eye(SIZE), atol=1e-5)
+        np.testing.assert_allclose(gate.T @ gate, np.eye(size), atol=2e-6)
     assert np.abs(gates[0] - gates[1]).max() > 0.1
-    assert np.abs(gates[1] - gates[2]).max() > 0.1
+    # The factor Q of a normal matrix, with the signs that make the diagonal of R positive.
+    normal = np.asarray(jax.random.normal(key, (size, size)), np.float64)
+    factor, triangle = np.linalg.qr(normal)
+    expected = factor * np.sign(np.diag(triangle))
+    np.testing.assert_allclose(_orthogonal(key, size), expected, atol=1e-4)
+
+
+def test_initialisation_calls_no_factorisation_of_the_library() -> None:
+    """Batched over seeds it can wait for itself for ever, see `gru._orthogonal`."""
+
+    def initial(key: Array) -> object:
+        return GRU(8).init(key, jnp.zeros((1, 1, 2)), jnp.zeros((1, 8)))
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    assert "lapack" not in jax.jit(jax.vmap(initial)).lower(keys).as_text()

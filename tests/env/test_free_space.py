@@ -8,7 +8,7 @@ from grid_oracle import open_map
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sqn_jax.env.free_space import free_rectangles
+from sqn_jax.env.free_space import far_sides, free_rectangles
 
 QUADRANTS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # (step in rows, step in columns)
 
@@ -86,3 +86,23 @@ def test_an_open_border_is_refused(cell: tuple[int, int]) -> None:
     blocked[cell] = False
     with pytest.raises(ValueError, match="border"):
         free_rectangles(blocked, 8, 10)
+
+
+def test_far_sides_are_counted_from_the_cell_in_the_direction_of_the_sector() -> None:
+    # One cell, four quadrants: 5 columns wide and 3 rows high, seen from its near corner.
+    rectangles = np.full((4, 1, 1), 5 + 256 * 3, np.uint16)
+    sides = far_sides(rectangles).astype(np.int16).reshape(4)
+    columns, rows = (sides << 8).astype(np.int16) >> 8, sides >> 8
+    # Forward, the far side is that many sides on; backward, the cell's own side counts as one.
+    assert columns.tolist() == [5, -4, -4, 5]
+    assert rows.tolist() == [3, 3, -2, -2]
+
+
+def test_a_blocked_cell_has_its_near_sides_and_is_zero_in_the_first_sector_alone() -> None:
+    sides = far_sides(np.zeros((4, 1, 1), np.uint16)).reshape(4)
+    columns, rows = (sides << 8).astype(np.int16) >> 8, sides >> 8
+    assert columns.tolist() == [0, 1, 1, 0]
+    assert rows.tolist() == [0, 0, 1, 1]
+    longest = far_sides(np.full((4, 1, 1), 127 + 256 * 127, np.uint16)).reshape(4)
+    assert (longest[0] & 255, longest[0] >> 8) == (127, 127)
+    assert ((longest[2] << 8).astype(np.int16) >> 8, longest[2] >> 8) == (-126, -126)

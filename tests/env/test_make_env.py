@@ -45,7 +45,7 @@ def test_a_map_may_come_from_a_file_or_from_memory_and_is_the_same(tmp_path: Pat
     save_map(small_map(), tmp_path / "small.yaml")
     from_file, from_memory = make_env(tmp_path / "small.yaml"), make_env(small_map())
     assert from_file.max_steps == from_memory.max_steps == 33
-    np.testing.assert_array_equal(from_file.sight.rectangles, from_memory.sight.rectangles)
+    np.testing.assert_array_equal(from_file.sight.far_sides, from_memory.sight.far_sides)
     np.testing.assert_array_equal(from_file.spawn_positions, from_memory.spawn_positions)
 
 

@@ -11,8 +11,10 @@ import pytest
 from grid_oracle import BEAMS, BOOLS, FLOATS, cast, longest_reading, open_map, random_map, wrap_map
 
 from sqn_jax.env import make_env, true_ranges
-from sqn_jax.env.raycast import cast_rays
-from sqn_jax.maps import OccupancyMap, sample_spawn_points
+from sqn_jax.env.raycast import cast_fan, cast_rays
+from sqn_jax.maps import OccupancyMap, load_map, sample_spawn_points
+
+BEAMS32 = BEAMS.astype(np.float32)
 
 
 class Scans(NamedTuple):
@@ -122,6 +124,34 @@ def test_rays_along_axes_and_diagonals_stop_at_the_first_occupied_cell(
             # From the centre of the first cell to the near side, or corner, of the last.
             expected = min((steps - 0.5) * diagonal * 0.05, 5.0)
             assert reading == pytest.approx(expected, abs=1e-4)
+
+
+def test_rays_that_graze_borders_far_from_the_corner_of_the_map_go_on() -> None:
+    """Within two degrees of an axis, up to 51 m from the map's corner."""
+    cave = load_map("cave")
+    grid = make_env(cave).sight
+    rng = np.random.default_rng(7)
+    free = np.argwhere(~cave.occupied)
+    cells = free[rng.integers(0, len(free), 4000), ::-1]
+    places = np.float32((cells + rng.uniform(0.01, 0.99, (4000, 2))) * 0.05)
+    quarter = rng.integers(0, 4, (4000, 1)) * (np.pi / 2)
+    angles = np.float32(quarter + rng.uniform(-0.035, 0.035, (4000, 8)))
+    cast_all = jax.vmap(lambda at, turn: cast_rays(grid, at, turn, max_range=5.0, iterations=8))
+    readings = np.asarray(jax.jit(cast_all)(places, angles))
+    x, y = np.float64(places[:, :1]), np.float64(places[:, 1:])
+    truth = cast(cave.occupied, 0.05, x, y, np.float64(angles))
+    np.testing.assert_allclose(readings, truth, atol=0.05)
+
+
+def test_a_fan_of_beams_reads_what_single_rays_read(hall: OccupancyMap) -> None:
+    grid = make_env(hall).sight
+    poses = random_poses(hall.occupied, 0.05, 200).astype(np.float32)
+    fan = jax.vmap(lambda pose: cast_fan(grid, pose, BEAMS32, max_range=5.0, iterations=8))(poses)
+    rays = jax.vmap(
+        lambda pose: cast_rays(grid, pose[:2], pose[2] + BEAMS32, max_range=5.0, iterations=8)
+    )(poses)
+    # An edge that one of two directions, a ten-millionth of a turn apart, just misses.
+    assert np.mean(np.abs(np.asarray(fan) - np.asarray(rays)) < 1e-3) > 0.999
 
 
 def test_beams_run_from_the_rightmost_to_the_leftmost() -> None:
