@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from experiments import common, robustness, table1
+from experiments import benchmark, common, robustness, table1
 from sqn_jax.compare import Settings
 
 TOLD = {"mean": 0.5, "std": 0.5, "ci95": [0.4, 0.6], "std_of_means": 0.025}
@@ -68,6 +68,34 @@ def test_both_scripts_at_a_tiny_budget(
     results = json.loads((tmp_path / "runs" / "robustness.json").read_text())
     assert len(results["results"]) == 2 * 7 * 2  # Agents, noises, radii.
     assert (tmp_path / "runs" / "robustness.png").stat().st_size > 10_000
+
+
+def test_the_benchmark_times_every_program_and_writes_what_it_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--maps", "maze", "--envs", "2", "3", "--steps", "4", "--repeats", "3"]
+    call(benchmark.main, [*words, "--out", str(tmp_path / "speed.json")], monkeypatch)
+    found = json.loads((tmp_path / "speed.json").read_text())
+    ours = [entry for entry in found["simulator"] if entry["program"] == "sqn_jax, maze"]
+    assert [entry["num_envs"] for entry in ours] == [2, 3]
+    printed = capsys.readouterr().out
+    for entry in ours:
+        assert 0 < entry["slowest"] <= entry["steps_per_second"] <= entry["fastest"]
+        assert f"{entry['steps_per_second']:,}" in printed
+    with pytest.raises(SystemExit) as stopped:
+        call(benchmark.main, ["--steps", "0"], monkeypatch)
+    assert stopped.value.code == 2
+    assert "--steps is 0" in capsys.readouterr().err
+
+
+def test_a_benchmark_is_told_in_times_of_jaxnav_with_as_many_robots() -> None:
+    entries = [
+        {"program": "sqn_jax, maze", "num_envs": 64, "steps_per_second": 300_000},
+        {"program": "sqn_jax, maze", "num_envs": 256, "steps_per_second": 500_000},
+        {"program": "JaxNav", "num_envs": 64, "steps_per_second": 40_000},
+    ]
+    rows = benchmark.table(entries).splitlines()[2:]
+    assert [row.split("|")[-2].strip() for row in rows] == ["7.5", "-", "1.0"]
 
 
 def test_runs_with_other_settings_are_not_taken_for_these(
