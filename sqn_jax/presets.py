@@ -17,7 +17,7 @@ def _quick() -> TrainConfig:
     """Recurrent PQN within the budget of two CPU cores."""
     return TrainConfig(
         method="pqn",
-        total_episodes=81_920,
+        total_episodes=102_400,
         num_envs=256,
         rounds_per_chunk=2,
         env=EnvConfig(near_goal_fraction=0.3),
