@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from sqn_jax.compare import Settings, load_maps, with_references
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.presets import PRESETS
 from sqn_jax.runlog import RunFolder
@@ -44,6 +45,17 @@ def episodes_and_seeds(options: argparse.Namespace) -> tuple[int, int]:
 def runs_folder(options: argparse.Namespace) -> Path:
     """Where the runs of these options are kept."""
     return options.runs or Path("runs") / f"table_{options.preset}"
+
+
+def prepare(options: argparse.Namespace, settings: Settings) -> tuple[list[Path], Path]:
+    """Train what is missing; returns the run folders and the folder for the results.
+
+    What would be refused afterwards, an unusable map or folder, is refused before.
+    """
+    load_maps(with_references([], references=True), settings)
+    out: Path = options.out or runs_folder(options)
+    out.mkdir(parents=True, exist_ok=True)
+    return train_missing(options), out
 
 
 def train_missing(options: argparse.Namespace) -> list[Path]:

@@ -9,17 +9,15 @@ episode in robustness.jsonl), robustness.md and robustness.png.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from experiments.common import (
     add_options,
     episodes_and_seeds,
+    prepare,
     run,
-    runs_folder,
-    train_missing,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies, load_maps, with_references
+from sqn_jax.compare import Settings, group_policies
 from sqn_jax.policies import load_policy
 from sqn_jax.scores import results_table
 from sqn_jax.session import evaluate_session
@@ -47,11 +45,7 @@ def main() -> None:
         ),
         noise_unit=options.noise_unit,
     )
-    # What would be refused later is refused before hours of training.
-    load_maps(with_references([], references=True), settings)
-    out: Path = options.out or runs_folder(options)
-    out.mkdir(parents=True, exist_ok=True)
-    folders = train_missing(options)
+    folders, out = prepare(options, settings)
     agents = group_policies([load_policy(folder) for folder in folders])
     evaluation = evaluate_session(list(agents), settings, out / "robustness.json")
     radius = settings.goal_radii[0]

@@ -11,18 +11,16 @@ it shows that everything works.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from experiments.common import (
     add_options,
     episodes_and_seeds,
+    prepare,
     run,
-    runs_folder,
-    train_missing,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies, load_maps, with_references
+from sqn_jax.compare import Settings, group_policies, with_references
 from sqn_jax.policies import load_policy
 from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.runlog import RunFolder
@@ -99,11 +97,7 @@ def main() -> None:
     options = parser.parse_args()
     episodes, eval_seeds = episodes_and_seeds(options)
     settings = Settings(maps=tuple(options.maps), episodes=episodes, eval_seeds=eval_seeds)
-    # What would be refused later is refused before hours of training.
-    load_maps(with_references([], references=True), settings)
-    out: Path = options.out or runs_folder(options)
-    out.mkdir(parents=True, exist_ok=True)
-    folders = train_missing(options)
+    folders, out = prepare(options, settings)
     curves: dict[str, list[Any]] = {}
     for folder in folders:
         run_folder, config = RunFolder.open(folder)

@@ -15,7 +15,6 @@ import io
 import os
 import re
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -238,20 +237,18 @@ def _evaluate(words: list[str]) -> int:
     return 0
 
 
-RUN_FILES = ("config.json", "summary.json", "evaluation.json", "metrics.json")
-
-
 def _require_writable(path: Path) -> None:
+    from sqn_jax.runlog import CONFIG, OWN_NAMES, probe_writable
+
     if path.suffix != ".json":
         raise ValueError(f"--out is {path}, expected a file ending in .json")
     records = path.with_suffix(".jsonl")
     if not path.parent.is_dir() or path.is_dir() or records.is_dir():
         raise ValueError(f"--out {path}: expected a file in an existing folder")
-    if (path.parent / "config.json").is_file() and path.name in RUN_FILES:
+    if (path.parent / CONFIG).is_file() and path.stem in OWN_NAMES:
         raise ValueError(f"--out {path}: is a file of that run itself, expected another name")
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
+        probe_writable(path.parent)
     except OSError as error:
         raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
 

@@ -23,6 +23,8 @@ from sqn_jax.config import TrainConfig
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+OWN_NAMES = ("config", "evaluation", "metrics", "summary")
+"""Names of a run's own files, whatever they end in."""
 
 
 class RunFolder:
@@ -47,8 +49,7 @@ class RunFolder:
             )
         try:
             path.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=path):
-                pass
+            probe_writable(path)
             _write_whole(path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
         except OSError as error:
             raise ValueError(f"run folder {path}: cannot be written ({error.strerror})") from None
@@ -94,6 +95,12 @@ class RunFolder:
     def write_records(self, name: str, records: Iterable[Mapping[str, Any]]) -> None:
         """Write a JSON lines file of the folder as a whole or not at all."""
         write_records(self.path / name, records)
+
+
+def probe_writable(folder: Path) -> None:
+    """Raise OSError where no file can be written."""
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

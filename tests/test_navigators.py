@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiling_quickly
 
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.bug import BugNavigator
@@ -50,9 +51,8 @@ def small_room(max_steps: int = 60, **config: Any) -> tuple[OccupancyMap, EnvPar
 @pytest.fixture(autouse=True, scope="module")
 def quick_compilation() -> Iterator[None]:
     """Compiling these programs takes longer than running them a few times."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    with compiling_quickly():
+        yield
 
 
 @pytest.fixture(scope="module")

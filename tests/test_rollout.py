@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiling_quickly
 from jax import Array
 from rooms import random_params, small_room
 from scipy import stats
@@ -38,9 +39,8 @@ step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, None)))
 @pytest.fixture(autouse=True, scope="module")
 def quick_compilation() -> Iterator[None]:
     """Compiling these programs takes longer than running them a few times."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    with compiling_quickly():
+        yield
 
 
 @pytest.fixture(scope="module")

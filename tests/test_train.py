@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiling_quickly
 
 from sqn_jax import train
 from sqn_jax.config import ReplayConfig, TrainConfig
@@ -32,14 +31,6 @@ METRICS = {
         "skill_distance",
     ),
 }
-
-
-@contextlib.contextmanager
-def compiling_quickly() -> Iterator[None]:
-    """Leave out XLA's costly optimisations for a program that runs only a few times."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")
