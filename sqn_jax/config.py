@@ -56,12 +56,12 @@ class EnvConfig:
     """Goal heading as one number (psi + pi) / 2 pi, or as sine and cosine scaled to 0..1."""
     max_steps: int = 0
     """Steps an episode; 0 takes the map's own limit (400, in the cave 1200)."""
-    coverage_cell: float = 0.25
-    """Side of the cells on which the covered area is counted, m."""
-    ray_sectors: int = 36
+    coverage_cell: float = 0.325
+    """Distance of the points on which the covered area is counted, m."""
+    ray_sectors: int = 32
     """Directions in the free-space table of the ray caster; a multiple of 4."""
     ray_iterations: int = 8
-    """Free rectangles a ray may cross before its reading is cut short."""
+    """Free rectangles a ray may cross before it is cut short, at most; a map may need fewer."""
     velocity_noise: float = 0.0
     """Sigma of Gaussian noise on the executed velocity."""
     velocity_noise_unit: Literal["relative", "absolute"] = "relative"

@@ -19,7 +19,15 @@ from jax import Array
 from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.config import Algorithm, NetworkConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation, navigation
-from sqn_jax.rollout import EpisodeSummary, Fleet, Trace, start_fleet, summarize, unroll
+from sqn_jax.rollout import (
+    EpisodeSummary,
+    Fleet,
+    Trace,
+    noise_keys,
+    start_fleet,
+    summarize,
+    unroll,
+)
 
 LANES = 100
 """Episodes that are driven side by side."""
@@ -135,10 +143,8 @@ def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, Observatio
     def one(key: Array) -> tuple[Array, Observation, EnvState]:
         start_key, drive_key = jax.random.split(key)
         start = navigation.reset(jax.random.split(start_key, 1)[0], env_params)
-        step_keys = jax.vmap(lambda k: jax.random.split(jax.random.split(k)[1], 1)[0])(
-            jax.random.split(drive_key, env_params.max_steps)
-        )
-        return step_keys, *start
+        noise_key = jax.random.split(drive_key)[1]
+        return noise_keys(noise_key, env_params.max_steps, 1)[:, 0], *start
 
     return jax.vmap(one, out_axes=(1, 0, 0))(keys)
 

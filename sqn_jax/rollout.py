@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.experience import Episodes
-from sqn_jax.agent.exploration import epsilon_greedy
+from sqn_jax.agent.exploration import draw_exploration, epsilon_greedy
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
@@ -105,8 +105,13 @@ def unroll(
     act_and_step = partial(
         _act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
     )
-    keys = jax.random.split(key, num_steps)
-    last, (observations, poses, actions, results, outputs) = jax.lax.scan(act_and_step, fleet, keys)
+    explore_key, noise_key = jax.random.split(key)
+    shape = (num_steps, epsilon.shape[0])
+    draws = draw_exploration(explore_key, shape, navigation.NUM_ACTIONS)
+    chance = (*draws, noise_keys(noise_key, *shape))
+    last, (observations, poses, actions, results, outputs) = jax.lax.scan(
+        act_and_step, fleet, chance
+    )
     reward, terminated, info = results
     episodes = Episodes(
         obs=jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), observations, last.obs),
@@ -128,9 +133,14 @@ def unroll(
     return last, episodes, trace
 
 
+def noise_keys(key: Array, num_steps: int, num_envs: int) -> Array:
+    """The keys [T, N] that an unroll hands to the simulator; the key is consumed."""
+    return jax.random.split(key, (num_steps, num_envs))
+
+
 def _act_and_step(
     fleet: Fleet,
-    key: Array,
+    chance: tuple[Array, Array, Array],
     *,
     network: QNetwork,
     params: Params,
@@ -138,11 +148,10 @@ def _act_and_step(
     env_params: EnvParams,
 ) -> tuple[Fleet, tuple[Any, ...]]:
     """One step of all robots: Q-values, action, simulator."""
-    action_key, step_key = jax.random.split(key)
+    coins, random_actions, step_keys = chance
     carry, output = network.apply(params, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
     output = jax.tree.map(lambda x: x[0], output)
-    action = epsilon_greedy(action_key, output.q_values, epsilon)
-    step_keys = jax.random.split(step_key, action.shape[0])
+    action = epsilon_greedy(output.q_values, epsilon, coins, random_actions)
     step = jax.vmap(navigation.step, in_axes=(0, 0, 0, None))
     obs, state, reward, terminated, _, info = step(step_keys, fleet.state, action, env_params)
     emitted = (fleet.obs, fleet.state.pose, action, (reward, terminated, info), output)

@@ -62,7 +62,7 @@ def fleet(room: EnvParams) -> Fleet:
 def half_random(room: EnvParams, params: Any, fleet: Fleet) -> Any:
     """Last fleet, episodes and trace of robots that act at random half of the time."""
     epsilon = jnp.array([0.5] * ROBOTS)
-    return drive(jax.random.key(2), NETWORK, params, fleet, epsilon, room, num_steps=LENGTH)
+    return drive(jax.random.key(8), NETWORK, params, fleet, epsilon, room, num_steps=LENGTH)
 
 
 def test_robots_start_apart_from_each_other_in_free_space_without_a_memory(fleet: Fleet) -> None:

@@ -27,19 +27,36 @@ def epsilon_per_robot(progress: Array, num_envs: int, config: ExplorationConfig)
     return jnp.minimum(jnp.linspace(0.0, 2.0, num_envs) * epsilon, 1.0)
 
 
-def epsilon_greedy(key: Array, q_values: Array, epsilon: Array) -> Array:
-    """Choose the best of A actions, or with probability `epsilon` any of them.
+def draw_exploration(key: Array, shape: tuple[int, ...], num_actions: int) -> tuple[Array, Array]:
+    """Draw all the chance that `epsilon_greedy` needs, for many steps at once.
+
+    On the CPU a few random numbers cost as much as many thousand: drawn step by step they would
+    take longer than the network.
 
     Args:
         key: consumed.
+        shape: e.g. T steps of N robots.
+        num_actions: A.
+
+    Returns:
+        Coins in 0..1 and actions in 0..A - 1, int32, of the given shape, all independent.
+    """
+    coin_key, action_key = jax.random.split(key)
+    coins = jax.random.uniform(coin_key, shape)
+    return coins, jax.random.randint(action_key, shape, 0, num_actions)
+
+
+def epsilon_greedy(q_values: Array, epsilon: Array, coins: Array, random_actions: Array) -> Array:
+    """Choose the best of A actions, or with probability `epsilon` any of them.
+
+    Args:
         q_values: [N, A].
         epsilon: [N].
+        coins: [N] from `draw_exploration`.
+        random_actions: [N] from `draw_exploration`.
 
     Returns:
         [N] int32 actions.
     """
-    explore_key, action_key = jax.random.split(key)
-    num_robots, num_actions = q_values.shape
-    explore = jax.random.uniform(explore_key, (num_robots,)) < epsilon
-    random_action = jax.random.randint(action_key, (num_robots,), 0, num_actions)
-    return jnp.where(explore, random_action, jnp.argmax(q_values, axis=-1)).astype(jnp.int32)
+    best = jnp.argmax(q_values, axis=-1).astype(jnp.int32)
+    return jnp.where(coins < epsilon, random_actions, best)

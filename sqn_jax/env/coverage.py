@@ -1,169 +1,308 @@
 """The area the robot has seen: the paper's map coverage M (section III-C, eq. 6).
 
 A place counts as seen if it lies in the field of view and no farther than the reading of the beam
-nearest in angle: sectors, since single lines are 0.44 m apart at 5 m. The map is divided into
-coverage cells with one sample point each, and the covered area is the number of seen points times
-the area of a cell. The points are offset differently in each row and column, so that walls along
-the axes do not beat against the lattice. Only the cells within the range of the sensor are looked
-at in a step; eight of a row share a byte.
+nearest in angle: sectors, since single lines are 0.44 m apart at 5 m. Seen area is counted on a
+lattice of points, each of which stands for a square of the lattice's cell; a bit a point.
 
-Most of the simulator's time goes into this module: two thousand cells a step, each with an angle,
-a look-up of a reading and a comparison. See `stages.stage` for how it is kept in vector code.
+A scan is drawn row by row of the lattice. What a row sees of a sector is an interval: between the
+two edges of the sector, which cross the row at y cot(angle), and within the half-chord
+sqrt(r^2 - y^2) of its circle. An interval of points is the difference of two powers of two, so
+that a whole row takes a few instructions a sector, without an angle or a look-up for each point.
+
+The lattice is turned against the map's axes by an angle whose tangent is the golden ratio.
+Otherwise a wall along an axis would run beside a whole row of points, and an error of half a cell
+in one would be an error in all.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
-from sqn_jax.env.geometry import polynomial_arctan2
-from sqn_jax.env.stages import stage
+from sqn_jax.env.arithmetic import fraction, larger, smaller, to_integer
 
-GOLDEN_RATIO = 0.618034
-SECOND_RATIO = 0.754878
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
+LATTICE_ANGLE = math.atan(GOLDEN_RATIO)
+"""Direction of the lattice's rows on the map, rad. Seen along an axis, its points fall as evenly as
+any: no ratio is farther from all simple fractions."""
+
+ROW_BITS = 31
+"""Points in a word of a scan; a power of two for the place after the last still fits 32 bits."""
+
+LARGEST_BLOCK = 20
+"""Sectors that are drawn in one pass of a loop; all in one would take long to compile."""
+
+FAR = 1e9
+"""Stands for infinity, cells; times the smallest distance of a row it is still out of range."""
 
 
-def grid_shape(height_m: float, width_m: float, cell: float) -> tuple[int, int]:
-    """Rows and bytes a row of the coverage of a map, for `height_m` x `width_m` metres."""
-    return math.ceil(height_m / cell), math.ceil(width_m / cell / 8)
+@dataclass(frozen=True)
+class Lattice:
+    """Where the points of a map lie and how they are stored; static.
+
+    In the lattice's own frame, in cells, point m of row n is at (m, n). Words of 32 points fill a
+    `covered` array [words, groups, group_rows] uint32: bit b of `covered[k, g, p]` is point
+    32 k + b of row g x group_rows + p.
+    """
+
+    height: float
+    """Extent of the map along y, m."""
+    width: float
+    """Extent of the map along x, m."""
+    cell: float
+    """Distance of neighbouring points, m."""
+    max_range: float
+    """Farthest reading of the sensor, m."""
+    origin: tuple[float, float]
+    """Where the map's corner (0, 0) lies in the lattice's frame, cells."""
+    num_words: int
+    """Words in a row."""
+    num_groups: int
+    """Groups of rows."""
+
+    @classmethod
+    def over(cls, height_m: float, width_m: float, cell: float, max_range: float) -> Self:
+        """The lattice for a map of `height_m` x `width_m` metres."""
+        corners = _turn(np.array([0.0, width_m, 0.0, width_m]), np.array([0, 0, 1, 1]) * height_m)
+        left, bottom = (math.floor(axis.min() / cell) - 1 for axis in corners)
+        columns, rows = (
+            axis.max() / cell - low + 2 for axis, low in zip(corners, (left, bottom), strict=True)
+        )
+        group_rows = math.ceil(max_range / cell)
+        return cls(
+            height=height_m,
+            width=width_m,
+            cell=cell,
+            max_range=max_range,
+            origin=(-left, -bottom),
+            num_words=math.ceil(columns / 32),
+            num_groups=math.ceil(rows / group_rows),
+        )
+
+    @property
+    def group_rows(self) -> int:
+        """Rows in a group: as many as a scan reaches above the robot, and below."""
+        return math.ceil(self.max_range / self.cell)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a `covered` array."""
+        return self.num_words, self.num_groups, self.group_rows
+
+    @property
+    def stride(self) -> int:
+        """Words are numbered group by group, with a number between groups that stands for none."""
+        return self.num_words + 1
+
+    def points(self) -> NDArray[np.float64]:
+        """Places of all points on the map, [words, groups, group_rows, 32, 2] x m, y m."""
+        rows = np.arange(self.num_groups * self.group_rows).reshape(1, *self.shape[1:], 1)
+        columns = np.arange(self.num_words * 32).reshape(-1, 1, 1, 32)
+        u, v = (columns - self.origin[0]) * self.cell, (rows - self.origin[1]) * self.cell
+        return np.stack(np.broadcast_arrays(*_turn(u, v, back=True)), axis=-1)
+
+    def on_map(self) -> NDArray[np.uint32]:
+        """The points that lie on the map, as a `covered` array; a sector may reach beyond it."""
+        x, y = np.moveaxis(self.points(), -1, 0)
+        inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return np.bitwise_or.reduce(np.uint32(inside) << np.arange(32, dtype=np.uint32), axis=-1)
 
 
-def empty(shape: tuple[int, int]) -> Array:
-    """A coverage [rows, bytes] in which nothing has been seen."""
-    return jnp.zeros(shape, jnp.uint8)
+def empty(lattice: Lattice) -> Array:
+    """A `covered` array in which nothing has been seen."""
+    return jnp.zeros(lattice.shape, jnp.uint32)
+
+
+def area(covered: Array, cell: float) -> Array:
+    """Seen area of a `covered` array, m2."""
+    return jax.lax.population_count(covered).astype(jnp.int32).sum() * cell**2
 
 
 def add_scan(
-    covered: Array,
-    pose: Array,
-    ranges: Array,
-    *,
-    field_of_view: float,
-    max_range: float,
-    cell: float,
-    always: Array,
+    covered: Array, pose: Array, ranges: Array, *, field_of_view: float, lattice: Lattice
 ) -> tuple[Array, Array]:
     """Mark what a scan sees.
 
     Args:
-        covered: [rows, bytes] uint8, the coverage so far.
+        covered: [words, groups, group_rows] uint32, the coverage so far.
         pose: [3] x m, y m, heading rad.
         ranges: [R] true readings, m, from the rightmost beam to the leftmost.
         field_of_view: angle from the first beam to the last, rad.
-        max_range: the farthest reading, m.
-        cell: side of a coverage cell, m.
-        always: True; see `stages.stage`.
+        lattice: the map's.
 
     Returns:
         The new coverage, and the newly seen area in m2.
     """
-    first_row = jnp.floor((pose[1] - max_range) / cell)
-    first_byte = jnp.floor((pose[0] - max_range) / (8 * cell))
-    num_rows = math.ceil(2 * max_range / cell) + 1
-    num_bytes = math.ceil((num_rows + 7) / 8)
-    rows = first_row + jnp.arange(num_rows, dtype=jnp.float32)
-    columns = 8 * first_byte + jnp.arange(8 * num_bytes, dtype=jnp.float32)
-    axes = stage(always, partial(_robot_axes, cell=cell), pose, rows, columns)
-    half_beams_per_radian = 2 * (ranges.shape[0] - 1) / field_of_view
-    to_half_beam = partial(_half_beams, per_radian=half_beams_per_radian, num_beams=ranges.shape[0])
-    half_beam, distance_squared = stage(always, to_half_beam, *axes)
-    limits = stage(always, _squared_readings, ranges)
-    seen = stage(always, _is_within, limits, half_beam, distance_squared)
-    window = stage(always, _pack_bits, seen)
-    place = partial(_place_window, shape=covered.shape)
-    on_map = stage(always, place, window, first_row, first_byte)
-    fresh = stage(always, _count_new_bits, on_map, covered)
+    u, v = _turn(pose[0] / lattice.cell, pose[1] / lattice.cell)
+    u, v = u + lattice.origin[0], v + lattice.origin[1]
+    sectors = _sectors(pose[2] - LATTICE_ANGLE, ranges / lattice.cell, field_of_view)
+    seen = _place(*_draw(u, v, sectors, lattice), lattice) & lattice.on_map()
+    fresh = jax.lax.population_count(seen & ~covered).astype(jnp.float32)
     # A product with ones: the CPU adds up a row so faster than by a reduction.
-    return covered | on_map, fresh @ jnp.ones(fresh.shape) * cell**2
+    counts = fresh @ jnp.ones(lattice.group_rows)
+    return covered | seen, counts.sum() * lattice.cell**2
 
 
-def area(covered: Array, cell: float) -> Array:
-    """Seen area of a coverage [rows, bytes], m2."""
-    return jax.lax.population_count(covered).astype(jnp.int32).sum() * cell**2
+def _turn(x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
+    """Coordinates on the map in the frame of the lattice, or `back` to the map."""
+    cosine, sine = math.cos(LATTICE_ANGLE), math.sin(LATTICE_ANGLE)
+    if back:
+        sine = -sine
+    return cosine * x + sine * y, cosine * y - sine * x
 
 
-def _robot_axes(
-    pose: Array, rows: Array, columns: Array, *, cell: float
-) -> tuple[Array, Array, Array, Array]:
-    """Sample points of [rows] x [columns] in the robot's frame, m.
+def _sectors(heading: Array, reaches: Array, field_of_view: float) -> Array:
+    """The sectors that reach into the half-plane above the robot, and those below.
 
-    The sample point of a cell is shifted along the row by an amount of the row's own, and along the
-    column by one of the column's own, so that both coordinates are sums.
+    Counter-clockwise from the lattice's +u axis for the half above, from -u for the half below.
+
+    Args:
+        heading: in the lattice's frame, rad.
+        reaches: [R] readings, cells.
+        field_of_view: rad.
 
     Returns:
-        Summands of the distance ahead [columns], [rows], and of that to the left [columns], [rows].
+        [4, S]: where the sectors' ends cross a row, as multiples of the row's distance, `-FAR`
+        beyond the half-plane, above and below; and the squares of the sectors' reaches, above and
+        below, -1 where nothing is seen. The first sector begins at or before the half-plane.
     """
-    x_of_column, x_of_row = columns * cell - pose[0], _fraction(rows * GOLDEN_RATIO) * cell
-    y_of_row, y_of_column = rows * cell - pose[1], _fraction(columns * SECOND_RATIO) * cell
-    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
-    return (
-        cosine * x_of_column + sine * y_of_column,
-        cosine * x_of_row + sine * y_of_row,
-        cosine * y_of_column - sine * x_of_column,
-        cosine * y_of_row - sine * x_of_row,
-    )
+    blind = reaches.shape[0]
+    limits, most = _sector_limits(blind, field_of_view)
+    cosine, sine = jnp.cos(heading), jnp.sin(heading)
+    cosines = cosine * np.cos(limits) - sine * np.sin(limits)
+    sines = sine * np.cos(limits) + cosine * np.sin(limits)
+    crossings = cosines / sines
+    above = jnp.where(sines > 1e-6, crossings, -FAR)
+    below = jnp.where(sines < -1e-6, crossings, -FAR)
+    table = jnp.concatenate([above, below, reaches * reaches, jnp.full(1, -1.0)])
+    angles = np.array([[0.0], [np.pi]], np.float32) - heading
+    sector = _sector_at(angles, blind, field_of_view) + np.arange(most, dtype=np.int32)[None]
+    following = sector + 1
+    sector = jnp.where(sector > blind, sector - (blind + 1), sector)
+    following = jnp.where(following > blind, following - (blind + 1), following)
+    own_row = np.array([[0], [blind + 1]], np.int32)
+    index = jnp.concatenate([following + own_row, sector + 2 * (blind + 1)])
+    return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _fraction(numbers: Array) -> Array:
-    return numbers - jnp.floor(numbers)
+def _sector_limits(num_beams: int, field_of_view: float) -> tuple[NDArray[np.float32], int]:
+    """Where the sectors begin, rad from the heading, and how many can touch a half-plane.
 
-
-def _half_beams(
-    ahead_of_column: Array,
-    ahead_of_row: Array,
-    left_of_column: Array,
-    left_of_row: Array,
-    *,
-    per_radian: float,
-    num_beams: int,
-) -> tuple[Array, Array]:
-    """Direction of each sample point as an index into `_squared_readings`, and distance squared."""
-    ahead = ahead_of_column[None] + ahead_of_row[:, None]
-    left = left_of_column[None] + left_of_row[:, None]
-    half_beam = polynomial_arctan2(left, ahead) * per_radian + num_beams
-    index = jnp.clip(half_beam, 0.0, 2.0 * num_beams - 1).astype(jnp.int32)
-    return index, ahead * ahead + left * left
-
-
-def _squared_readings(ranges: Array) -> Array:
-    """[2 R] squared reading that counts in each half of a sector; -1 beyond the field of view.
-
-    Between two beams the first half belongs to the one on the right, the second to the other.
+    One sector a beam, its neighbours halfway; those of the outermost beams end at the field of
+    view. The last of the [R + 1] sectors is what lies beyond it and cannot be seen.
     """
-    outside = jnp.full(1, -1.0)
-    return jnp.concatenate([outside, jnp.repeat(ranges * ranges, 2)[1:-1], outside])
+    spacing = field_of_view / (num_beams - 1)
+    between = (np.arange(1, num_beams) - 0.5) * spacing
+    limits = np.concatenate([[0.0], between, [field_of_view]])
+    widths = np.diff(limits, append=2 * np.pi)
+    # A half-plane that begins at the very end of sector k touches it and all within 180 degrees.
+    following = np.cumsum([np.roll(widths, -k - 1) for k in range(len(widths))], axis=1)
+    touched = 2 + (following < np.pi * (1 - 1e-6)).sum(axis=1)
+    most = int(min(touched.max(), len(widths)))
+    return (limits - field_of_view / 2).astype(np.float32), most
 
 
-def _is_within(limits: Array, index: Array, distance_squared: Array) -> Array:
-    return limits.at[index].get(mode="promise_in_bounds") >= distance_squared
+def _sector_at(angle: Array, num_beams: int, field_of_view: float) -> Array:
+    """Which sector a direction lies in, rad from the heading; `num_beams` beyond the view."""
+    wrapped = 2 * np.pi * (fraction(angle / (2 * np.pi) + 0.5) - 0.5)
+    beam = jnp.floor((wrapped / field_of_view + 0.5) * (num_beams - 1) + 0.5)
+    beam = smaller(larger(beam, 0.0), num_beams - 1.0)
+    return to_integer(jnp.where(jnp.abs(wrapped) > field_of_view / 2, float(num_beams), beam))
 
 
-def _pack_bits(bits: Array) -> Array:
-    """[rows, 8 bytes] bool to [rows, bytes] uint8, the first bit the lowest.
+def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, Array, list[Array]]:
+    """Draw the sectors [4, S] around a robot at (u, v) cells.
 
-    Four booleans are read as one number; a product shifts each to its place in the upper byte.
+    Rows above and rows below the robot are each in the order of a group of the lattice, so that a
+    row's place on the map needs no look-up, only the right group.
+
+    Returns:
+        For W words of `ROW_BITS` points of each row in reach: which word of the lattice, counted
+        with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it [W]
+        uint32; and the points that are seen, W times [2, group_rows] uint32.
     """
-    fours = bits.reshape(bits.shape[0], -1, 2, 4).astype(jnp.uint8)
-    number = jax.lax.bitcast_convert_type(fours, jnp.uint32)
-    nibbles = (number * jnp.uint32(0x01020408) >> 24) & 15
-    return (nibbles[..., 0] | nibbles[..., 1] << 4).astype(jnp.uint8)
+    radius = lattice.max_range / lattice.cell
+    places = jnp.arange(lattice.group_rows, dtype=jnp.float32)
+    lowest = jnp.floor(v) + 1
+    above = lowest + lattice.group_rows * fraction((places - lowest) / lattice.group_rows)
+    rows = jnp.floor(above[None] + np.array([[0.5], [0.5 - lattice.group_rows]], np.float32))
+    own_groups = jnp.floor((rows + 0.5) / lattice.group_rows)
+    num_words = math.ceil(2 * radius / ROW_BITS)
+    first_points = jnp.ceil(u - radius) + ROW_BITS * np.arange(num_words, dtype=np.float32)
+    own_words = jnp.floor(first_points / 32)
+    on_map = (own_words >= -1) & (own_words < lattice.num_words)
+    numbers = own_words[:, None, None] + lattice.stride * own_groups[None]
+    numbers = to_integer(jnp.where(on_map[:, None, None], numbers, -9.0))
+
+    num_blocks = math.ceil(sectors.shape[1] / LARGEST_BLOCK)
+    block = math.ceil(sectors.shape[1] / num_blocks)
+    missing = num_blocks * block - sectors.shape[1]
+    sectors = jnp.pad(sectors, ((0, 0), (0, missing)), constant_values=-1.0)
+    # From the point half a cell before the first, so that rounding a place to the next whole number
+    # counts the points before it.
+    draw = partial(_draw_block, rows=rows - v, starts=first_points - 0.5 - u, block=block)
+    # The first sector above the robot begins at the far right, the first one below at the left.
+    begin = jnp.broadcast_to(np.array([[FAR], [-FAR]], np.float32), rows.shape)
+    nothing = [jnp.zeros(rows.shape, jnp.uint32)] * num_words
+
+    def draw_next(index: Array, carry: Any) -> Any:
+        begin, words, _ = carry
+        part = jax.lax.dynamic_slice_in_dim(sectors, index * block, block, axis=1)
+        # What comes out of a loop is not merged into what follows and computed there once more for
+        # each word of the map; so the numbers come out of it, too.
+        return *draw(begin, words, part), numbers
+
+    start = (begin, nothing, jnp.zeros_like(numbers))
+    _, words, numbers = jax.lax.fori_loop(0, num_blocks, draw_next, start)
+    return numbers, to_integer(first_points - 32 * own_words).astype(jnp.uint32), words
 
 
-def _place_window(
-    window: Array, first_row: Array, first_byte: Array, *, shape: tuple[int, ...]
-) -> Array:
-    """The window where it belongs on a map of [rows, bytes], and nothing seen around it."""
-    # By a slice of a padded copy: a scatter is serial on the CPU.
-    rows, columns = shape
-    padded = jnp.pad(window, ((rows, rows), (columns, columns)))
-    start = (rows - first_row.astype(jnp.int32), columns - first_byte.astype(jnp.int32))
-    return jax.lax.dynamic_slice(padded, start, shape)
+def _draw_block(
+    begin: Array, words: list[Array], sectors: Array, *, rows: Array, starts: Array, block: int
+) -> tuple[Array, list[Array]]:
+    """Add a block of sectors to the words; returns where the last one ended, and the words."""
+    squares = rows * rows
+    for sector in range(block):
+        end = rows * sectors[:2, sector, None]
+        left, right = smaller(begin, end), larger(begin, end)
+        chord_squared = sectors[2:, sector, None] - squares
+        chord = jnp.where(chord_squared < 0, -FAR, jnp.sqrt(larger(chord_squared, 0.0)))
+        right = smaller(right, chord)
+        left = smaller(larger(left, -chord), right)
+        words = [
+            word | _power(right - start) - _power(left - start)
+            for word, start in zip(words, starts, strict=True)
+        ]
+        begin = end
+    return begin, words
 
 
-def _count_new_bits(seen: Array, covered: Array) -> Array:
-    """How many bits of each byte are newly seen, in a flat row of floats."""
-    return jax.lax.population_count(seen & ~covered).astype(jnp.float32).reshape(-1)
+def _power(number: Array) -> Array:
+    """2 to the number, rounded and clipped to 0..`ROW_BITS`, uint32."""
+    clipped = smaller(larger(number, 0.0), float(ROW_BITS))
+    # The mask changes nothing but tells the compiler that no shift is too long.
+    return jnp.uint32(1) << (to_integer(clipped).astype(jnp.uint32) & 31)
+
+
+def _place(numbers: Array, bits: Array, words: list[Array], lattice: Lattice) -> Array:
+    """The drawn words where they belong on the map, and nothing seen around them."""
+    word, group = np.ogrid[: lattice.num_words, : lattice.num_groups]
+    own_number = (word + group * lattice.stride).astype(np.int32)[..., None]
+    seen = jnp.zeros(lattice.shape, jnp.uint32)
+    for index, points in enumerate(words):
+        lower = points << bits[index]
+        # Upwards in two steps: by 32 at once, where nothing is left over, is no shift.
+        upper = points >> 1 >> (31 - bits[index])
+        for half in (0, 1):
+            number = jnp.expand_dims(numbers[index, half], (0, 1))
+            rest = jnp.where(own_number == number + 1, upper[half][None, None], jnp.uint32(0))
+            seen |= jnp.where(own_number == number, lower[half][None, None], rest)
+    return seen

@@ -72,7 +72,7 @@ def reset_to(
 ) -> tuple[Observation, EnvState]:
     """Start an episode at a given pose [3] and goal [2]; what the first scan sees is no reward."""
     ranges = true_ranges(pose, params)
-    covered, _ = _add_scan(coverage.empty(params.coverage_shape), pose, ranges, params)
+    covered, _ = _add_scan(coverage.empty(params.lattice), pose, ranges, params)
     state = EnvState(pose=pose, goal=goal, covered=covered, step=jnp.int32(0))
     return observe(key, ranges, state, params), state
 
@@ -160,7 +160,7 @@ def true_ranges(pose: Array, params: EnvParams) -> Array:
         pose,
         beams,
         max_range=params.config.max_range,
-        iterations=params.config.ray_iterations,
+        iterations=params.ray_iterations,
     )
 
 
@@ -171,11 +171,5 @@ def field_of_view(params: EnvParams) -> float:
 
 def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> tuple[Array, Array]:
     return coverage.add_scan(
-        covered,
-        pose,
-        ranges,
-        field_of_view=field_of_view(params),
-        max_range=params.config.max_range,
-        cell=params.config.coverage_cell,
-        always=params.sight.resolution > 0,
+        covered, pose, ranges, field_of_view=field_of_view(params), lattice=params.lattice
     )

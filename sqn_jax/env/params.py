@@ -6,6 +6,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.config import EnvConfig
+from sqn_jax.env.coverage import Lattice
 from sqn_jax.env.raycast import RayGrid
 
 
@@ -47,8 +48,10 @@ class EnvParams:
     """The static settings this was made from."""
     max_steps: int = struct.field(pytree_node=False)
     """Steps an episode."""
-    coverage_shape: tuple[int, int] = struct.field(pytree_node=False)
-    """Rows and bytes a row of `EnvState.covered`."""
+    ray_iterations: int = struct.field(pytree_node=False)
+    """Free rectangles a ray may cross before its reading is cut short."""
+    lattice: Lattice = struct.field(pytree_node=False)
+    """The points on which the covered area is counted."""
 
 
 @struct.dataclass
@@ -60,7 +63,7 @@ class EnvState:
     goal: Array
     """[2] x m, y m."""
     covered: Array
-    """[rows, bytes] uint8: the seen coverage cells, eight a byte."""
+    """[words, groups, group_rows] uint32: the points seen so far, one a bit; see `Lattice`."""
     step: Array
     """int32: steps taken."""
 

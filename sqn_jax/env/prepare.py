@@ -13,8 +13,9 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import coverage
-from sqn_jax.env.free_space import far_sides, free_rectangles
+from sqn_jax.env.arithmetic import LARGEST_INTEGER
+from sqn_jax.env.coverage import Lattice
+from sqn_jax.env.free_space import far_sides, free_rectangles, hops_needed
 from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
@@ -69,11 +70,14 @@ def make_env(
     body_free = traversable(occupancy_map.occupied, occupancy_map.resolution, config.robot_radius)
     positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
-    height_m, width_m = np.array(occupancy_map.occupied.shape) * occupancy_map.resolution
+    height_m, width_m = (side * occupancy_map.resolution for side in occupancy_map.occupied.shape)
+    sight = _ray_grid(
+        occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
+    )
+    sides = np.moveaxis(np.asarray(sight.far_sides).reshape(sight.height, sight.width, -1), -1, 0)
+    reach = config.max_range / occupancy_map.resolution
     return EnvParams(
-        sight=_ray_grid(
-            occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
-        ),
+        sight=sight,
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
@@ -98,7 +102,8 @@ def make_env(
         ),
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
-        coverage_shape=coverage.grid_shape(height_m, width_m, config.coverage_cell),
+        ray_iterations=hops_needed(sides, reach, config.ray_iterations),
+        lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
     )
 
 
@@ -140,13 +145,14 @@ def _ray_grid(
 ) -> RayGrid:
     reach = min(math.ceil(reach_m / resolution), 127)  # What a signed byte holds.
     height, width = blocked.shape
-    if sectors * height * width >= 2**31:
+    if sectors * height * width >= 2**31 or 128 * width > LARGEST_INTEGER:
         raise ValueError(
             f"the map has {height} x {width} cells, expected fewer than {2**31 // sectors:,} "
             f"with env.ray_sectors {sectors}"
         )
+    sides = far_sides(free_rectangles(blocked, sectors, reach))
     return RayGrid(
-        far_sides=jnp.asarray(far_sides(free_rectangles(blocked, sectors, reach)).reshape(-1)),
+        far_sides=jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1)),
         resolution=jnp.float32(resolution),
         height=height,
         width=width,

@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sqn_jax.agent.exploration import epsilon_greedy, epsilon_per_robot, epsilon_schedule
+from sqn_jax.agent.exploration import (
+    draw_exploration,
+    epsilon_greedy,
+    epsilon_per_robot,
+    epsilon_schedule,
+)
 from sqn_jax.config import ExplorationConfig
 
 PAPER = ExplorationConfig(epsilon_start=0.4, epsilon_end=0.1)
-greedy = jax.jit(epsilon_greedy)
+
+
+@jax.jit
+def greedy(key: jax.Array, q_values: jax.Array, epsilon: jax.Array) -> jax.Array:
+    return epsilon_greedy(q_values, epsilon, *draw_exploration(key, epsilon.shape, 4))
 
 
 @pytest.mark.parametrize(

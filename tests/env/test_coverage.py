@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from driving import Drive
-from grid_oracle import open_map, random_map, scan, seen_areas, sees, wrap_map
+from grid_oracle import open_map, random_map, seen_areas, wrap_map
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
-from sqn_jax.env.geometry import polynomial_arctan2
+from sqn_jax.env.coverage import Lattice, add_scan, area, empty
 from sqn_jax.maps import OccupancyMap, sample_spawn_points
 
 start_at = jax.jit(reset_to)
@@ -19,8 +19,13 @@ FINE = EnvConfig(coverage_cell=0.05, max_steps=100)
 
 
 def covered_area(covered: np.ndarray, cell: float) -> np.ndarray:
-    """Area of coverages [..., rows, bytes], m2."""
-    return np.unpackbits(covered, axis=-1).sum(axis=(-1, -2), dtype=np.int64) * cell**2
+    """Area of coverages [..., words, groups, group_rows], m2."""
+    return bits(covered).sum(axis=(-1, -2, -3, -4), dtype=np.int64) * cell**2
+
+
+def bits(covered: np.ndarray) -> np.ndarray:
+    """Coverages [..., words, groups, group_rows] as booleans [..., 32], the lowest bit first."""
+    return (np.asarray(covered)[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
 
 
 @pytest.mark.parametrize("place", ["maze", "hall"])
@@ -100,31 +105,61 @@ def test_no_edge_of_what_is_in_range_is_lost_with_coarse_cells() -> None:
     assert covered_area(np.asarray(states.covered), 1.0).mean() == pytest.approx(76.36, abs=0.6)
 
 
-def test_the_cells_marked_are_those_that_are_seen() -> None:
-    # Which bit stands for which place: x runs along the bytes, the highest bit is not the first.
-    occupied = random_map(seed=9, rows=80, columns=140, blocks=3, pillars=12)
-    params = make_env(wrap_map(occupied, sample_spawn_points(occupied, 0.05, 0.1, 2)), FINE)
-    row, column = np.argwhere(~occupied)[1700]
-    pose = np.array([(column + 0.5) * 0.05, (row + 0.5) * 0.05, 0.7], np.float32)
-    _, state = start_at(jax.random.key(0), pose, jnp.array([1.0, 1.0]), params)
-    marked = np.unpackbits(np.asarray(state.covered), axis=-1, bitorder="little")[:80, :140]
-    # A cell's sample point lies somewhere in it; cells seen, or not, at all four corners are sure.
-    x, y = np.meshgrid(np.arange(141) * 0.05, np.arange(81) * 0.05)
-    corner = sees(pose.astype(float), scan(occupied, 0.05, pose), x, y)
-    count = corner[1:, 1:].astype(int) + corner[1:, :-1] + corner[:-1, 1:] + corner[:-1, :-1]
-    assert marked[count == 4].mean() > 0.995
-    assert marked[count == 0].mean() < 0.005
-    assert (count == 4).sum() > 1000
-    assert (count == 0).sum() > 1000
-
-
-def test_the_quick_arctangent_is_the_arctangent() -> None:
-    rng = np.random.default_rng(0)
-    y, x = rng.normal(size=(2, 100_000)) * 10.0 ** rng.integers(-3, 3, (2, 100_000))
-    got = np.asarray(polynomial_arctan2(jnp.asarray(y, jnp.float32), jnp.asarray(x, jnp.float32)))
-    np.testing.assert_allclose(got, np.arctan2(y, x), atol=2.1e-5)
-    axes = jnp.array([0.0, 1.0, 0.0, -1.0]), jnp.array([1.0, 0.0, -1.0, 0.0])
-    np.testing.assert_allclose(
-        polynomial_arctan2(*axes), [0, np.pi / 2, np.pi, -np.pi / 2], atol=2.1e-5
+@pytest.mark.parametrize(
+    ("field_of_view_deg", "num_beams", "cell"),
+    [(350, 71, 0.325), (350, 71, 0.05), (90, 5, 0.1), (359, 12, 0.2), (200, 3, 0.1), (5, 2, 0.05)],
+)
+def test_the_points_marked_are_those_that_are_seen(
+    field_of_view_deg: float, num_beams: int, cell: float
+) -> None:
+    """Point by point, anywhere on a map that is not square, for sensors of all kinds."""
+    view = np.deg2rad(field_of_view_deg)
+    lattice = Lattice.over(9.0, 17.0, cell, 5.0)
+    x, y = np.moveaxis(lattice.points(), -1, 0)
+    on_map = (x >= 0) & (x < 17) & (y >= 0) & (y < 9)
+    mark = jax.jit(
+        lambda pose, ranges: add_scan(
+            empty(lattice), pose, ranges, field_of_view=view, lattice=lattice
+        )
     )
-    assert np.isfinite(polynomial_arctan2(jnp.float32(0), jnp.float32(0)))
+    rng = np.random.default_rng(num_beams)
+    wrong, seen = 0, 0
+    for turn in range(25):
+        pose = rng.uniform([0, 0, -9], [17, 9, 9]).astype(np.float32)
+        long = np.full(num_beams, rng.uniform(2, 5))
+        ranges = (long if turn % 3 == 0 else rng.uniform(0.1, 5, num_beams)).astype(np.float32)
+        covered, fresh = mark(pose, ranges)
+        bearing = np.arctan2(y - float(pose[1]), x - float(pose[0])) - float(pose[2])
+        bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+        nearest = np.rint((bearing + view / 2) / view * (num_beams - 1)).astype(int)
+        reading = ranges[np.clip(nearest, 0, num_beams - 1)]
+        distance = np.hypot(x - float(pose[0]), y - float(pose[1]))
+        truth = (np.abs(bearing) <= view / 2) & (distance <= reading) & on_map
+        wrong += np.sum(bits(covered) != truth)
+        seen += truth.sum()
+        assert fresh == pytest.approx(bits(covered).sum() * cell**2, rel=1e-5)
+        assert area(covered, cell) == pytest.approx(bits(covered).sum() * cell**2, rel=1e-5)
+    assert seen > 200
+    # A point on the very edge of a sector, in single precision.
+    assert wrong <= max(1, seen // 20_000)
+
+
+def test_the_points_of_a_lattice_fill_the_map_evenly() -> None:
+    """Each stands for a square of the lattice's cell; the map's corners are within."""
+    points = Lattice.over(6.0, 11.0, 0.2, 5.0).points()
+    x, y = points[..., 0], points[..., 1]
+    for left, bottom, width, height in ((0, 0, 11, 6), (0, 0, 2, 2), (9, 4, 2, 2), (4, 1, 3, 4)):
+        inside = (left <= x) & (x < left + width) & (bottom <= y) & (y < bottom + height)
+        assert inside.sum() * 0.2**2 == pytest.approx(width * height, rel=0.03)
+    assert len(np.unique(points.reshape(-1, 2).round(6), axis=0)) == x.size
+
+
+def test_no_wall_along_an_axis_runs_beside_a_row_of_points() -> None:
+    """The area left of a wall must not jump with the wall: 8 m long, moved by millimetres."""
+    points = Lattice.over(8.0, 8.0, 0.325, 5.0).points()
+    for axis in (0, 1):
+        walls = np.linspace(3, 5, 400)
+        inside = np.all((points >= 0) & (points < 8), axis=-1)
+        count = np.array([np.sum(inside & (points[..., axis] < wall)) for wall in walls])
+        # The lattice of a row a cell would be off by up to 0.16 m x 8 m = 1.3 m2.
+        assert np.max(np.abs(count * 0.325**2 - walls * 8)) < 0.65
