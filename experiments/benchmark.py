@@ -1,166 +1,157 @@
-"""How fast the simulator is, beside JaxNav where that is installed.
+"""How fast simulator, learner and training are, beside other programs where those are installed.
 
-    .venv/bin/python experiments/benchmark.py [--maps maze cave] [--envs 64 256 1024] [--out FILE]
+    .venv/bin/python experiments/benchmark.py [--parts simulator learner train] [--out FILE]
 
-Steps a second of many robots with random actions: rays, coverage, reward and observation for ours;
-rays, reward and observation for JaxNav (`pip install jaxmarl`), with one robot, 71 beams of 5 m,
-with and without its reset in every step. All programs are compiled and warmed up first and then
-take turns, so that a busy moment of the machine hits all of them; told are medians.
+`simulator`: steps a second with random actions, beside JaxNav (`bench_simulator.py`). `learner`:
+R2D2 updates of the preset `paper`, beside PyTorch and beside the machine's rate of matrix products
+(`bench_learner.py`). `train`: the compiled training program of a preset (`bench_train.py`). What is
+compared takes turns; told are medians. `.venv/bin/python -m pip install -e ".[bench]"` installs
+JaxNav and PyTorch.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import os
-import statistics
+import platform
 import sys
-import time
-import warnings
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-from jax import Array
 
 import sqn_jax
-from experiments.common import run
-from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
+from experiments import bench_learner, bench_simulator, bench_train
+from experiments.common import ALGORITHMS, run
+from sqn_jax.env import make_env
+from sqn_jax.presets import PRESETS
 from sqn_jax.runlog import write_json
-from sqn_jax.scores import markdown_table
 
-Program = Callable[[Array], Any]
-
-
-@partial(jax.jit, static_argnames=("num_envs", "num_steps"))
-def drive_ours(key: Array, params: EnvParams, num_envs: int, num_steps: int) -> Any:
-    """Observations and rewards of robots with random actions."""
-    start_key, drive_key = jax.random.split(key)
-    _, states = jax.vmap(reset, in_axes=(0, None))(jax.random.split(start_key, num_envs), params)
-
-    def body(states: Any, key: Array) -> tuple[Any, Any]:
-        action_key, step_key = jax.random.split(key)
-        actions = jax.random.randint(action_key, (num_envs,), 0, NUM_ACTIONS)
-        keys = jax.random.split(step_key, num_envs)
-        obs, states, reward, _, _, info = jax.vmap(step, in_axes=(0, 0, 0, None))(
-            keys, states, actions, params
-        )
-        return states, (obs, reward, info["reached"])
-
-    return jax.lax.scan(body, states, jax.random.split(drive_key, num_steps))[1]
+PARTS = ("simulator", "learner", "train")
 
 
-def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
-    """The same for JaxNav; None where it is not installed."""
+def simulator(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure and print the simulator's part."""
+    if _version("jaxmarl") is None:
+        print("jaxmarl is not installed: no comparison with JaxNav\n")
+    entries = bench_simulator.measure(options.maps, options.envs, options.steps, options.repeats)
+    print(bench_simulator.table(entries), end="\n\n")
+    return {"simulator": entries}
+
+
+def learner(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure and print the learner's part."""
+    config = PRESETS["paper"]
+    missing = bench_learner.missing_torch()
+    if missing:
+        print(missing, end="\n\n")
+    told = bench_learner.measure(
+        config,
+        make_env(config.map, config.env),
+        options.algos,
+        options.repeats,
+        torch_threads=() if missing else options.torch_threads,
+    )
+    size = told["products_size"]
+    rates = "; ".join(f"{name}: {rate:.0f}" for name, rate in told["products_gflops"].items())
+    print(bench_learner.table(told))
+    print(f"\nGFLOP/s in products of float32 matrices [{size}, {size}]: {rates}", end="\n\n")
+    return {"learner": told}
+
+
+def training(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure and print the part of whole training programs."""
+    entries = {}
+    for preset in options.presets:
+        config = PRESETS[preset]
+        env_params = make_env(config.map, config.env)
+        entries[preset] = bench_train.measure(config, env_params, options.repeats)
+    print(bench_train.table(entries), end="\n\n")
+    return {"train": entries}
+
+
+def memory() -> dict[str, Any]:
+    """Tell what the preset `paper` keeps in memory, and what this process held at most."""
+    config = PRESETS["paper"]
+    told = bench_train.memory(config, make_env(config.map, config.env))
+    megabytes = {name: value / 1e6 for name, value in told.items() if name.endswith("bytes")}
+    print(
+        f"Preset paper: {megabytes['replay_bytes']:.0f} MB for a replay of "
+        f"{told['replay_episodes']:,} episodes, {megabytes['run_bytes']:.0f} MB with those of a "
+        f"round. This process held {megabytes['peak_process_bytes']:.0f} MB at most."
+    )
+    return {"memory": told}
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were taken on and with."""
+    device = jax.devices()[0]
+    versions = {name: _version(name) for name in ("jax", "torch", "jaxmarl")}
+    return {
+        "command": " ".join(["experiments/benchmark.py", *sys.argv[1:]]),
+        "device": f"{device.platform} ({device.device_kind})",
+        "cpu": cpu_model(),
+        "cpu_count": os.cpu_count(),
+        "versions": {"sqn_jax": sqn_jax.__version__}
+        | {name: version for name, version in versions.items() if version is not None},
+    }
+
+
+def cpu_model() -> str:
+    """The processor by name, as well as the system tells it."""
     try:
-        from jaxmarl.environments.jaxnav import JaxNav  # type: ignore[import-not-found]
-    except ImportError:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
         return None
-    world = JaxNav(num_agents=1, act_type="Discrete", lidar_num_beams=71, lidar_max_range=5.0)
-    advance = world.step if resets else world.step_env
-
-    def drive(key: Array) -> Any:
-        start_key, drive_key = jax.random.split(key)
-        _, states = jax.vmap(world.reset)(jax.random.split(start_key, num_envs))
-
-        def body(states: Any, key: Array) -> tuple[Any, Any]:
-            action_key, step_key = jax.random.split(key)
-            actions = {"agent_0": jax.random.randint(action_key, (num_envs,), 0, NUM_ACTIONS)}
-            keys = jax.random.split(step_key, num_envs)
-            obs, states, reward, *_ = jax.vmap(advance)(keys, states, actions)
-            return states, (obs["agent_0"], reward["agent_0"])
-
-        return jax.lax.scan(body, states, jax.random.split(drive_key, num_steps))[1]
-
-    return jax.jit(drive)
 
 
-def programs(options: argparse.Namespace) -> dict[tuple[str, int], Program]:
-    """What is timed, by name and number of robots."""
-    found: dict[tuple[str, int], Program] = {}
-    for name in options.maps:
-        params = make_env(name)
-        for count in options.envs:
-            ours = partial(drive_ours, params=params, num_envs=count, num_steps=options.steps)
-            found[f"sqn_jax, {name}", count] = ours
-    for resets, name in ((False, "JaxNav"), (True, "JaxNav, reset in every step")):
-        for count in options.envs:
-            theirs = jaxnav(count, options.steps, resets=resets)
-            if theirs is not None:
-                found[name, count] = theirs
-    return found
+def parse() -> argparse.Namespace:
+    """The options.
 
-
-def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """One entry a program: steps a second, its quartiles, and the seconds to compile."""
-    timed = programs(options)
-    compile_seconds: dict[tuple[str, int], float] = {}
-    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in timed}
-    for key, program in timed.items():
-        started = time.perf_counter()
-        jax.block_until_ready(program(jax.random.key(0)))
-        compile_seconds[key] = time.perf_counter() - started
-    for turn in range(options.repeats):
-        for key, program in timed.items():
-            started = time.perf_counter()
-            jax.block_until_ready(program(jax.random.key(turn)))
-            seconds[key].append(time.perf_counter() - started)
-    entries = []
-    for (name, count), times in seconds.items():
-        steps = count * options.steps
-        entries.append(
-            {
-                "program": name,
-                "num_envs": count,
-                "steps_per_second": round(steps / statistics.median(times)),
-                "slowest": round(steps / max(times)),
-                "fastest": round(steps / min(times)),
-                "first_call_seconds": round(compile_seconds[name, count], 2),
-            }
-        )
-    return entries
-
-
-def table(entries: list[dict[str, Any]]) -> str:
-    """Steps a second, and how many times those of JaxNav with as many robots."""
-    base = {e["num_envs"]: e["steps_per_second"] for e in entries if e["program"] == "JaxNav"}
-    rows = []
-    for entry in entries:
-        ratio = entry["steps_per_second"] / base.get(entry["num_envs"], float("nan"))
-        told = f"{ratio:.1f}" if entry["num_envs"] in base else "-"
-        speed = f"{entry['steps_per_second']:,}"
-        rows.append([entry["program"], str(entry["num_envs"]), speed, told])
-    return markdown_table(["program", "robots", "steps a second", "times JaxNav"], rows)
-
-
-def main() -> None:
-    """Parse the options, measure, write."""
+    Raises:
+        ValueError: one of them is not positive.
+    """
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--maps", nargs="+", default=["maze", "cave"])
-    parser.add_argument("--envs", nargs="+", type=int, default=[64, 256, 1024])
-    parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--repeats", type=int, default=9, help="turns (default 9)")
+    parser.add_argument("--maps", nargs="+", default=["maze", "cave"], help="of the simulator")
+    parser.add_argument("--envs", nargs="+", type=int, default=[64, 256, 1024, 4096])
+    parser.add_argument("--steps", type=int, default=100, help="of the simulator, in one call")
+    parser.add_argument("--algos", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    cores = sorted({1, os.cpu_count() or 1})
+    parser.add_argument("--torch-threads", nargs="+", type=int, default=cores)
+    parser.add_argument("--presets", nargs="+", choices=list(PRESETS), default=["quick"])
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
     for name in ("steps", "repeats"):
         if getattr(options, name) < 1:
             raise ValueError(f"--{name} is {getattr(options, name)}, expected at least 1")
-    if min(options.envs) < 1:
-        raise ValueError(f"--envs holds {min(options.envs)}, expected at least 1")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # JaxNav's.
-        entries = measure(options)
-    print(table(entries))
+    for name, values in (("envs", options.envs), ("torch-threads", options.torch_threads)):
+        if min(values) < 1:
+            raise ValueError(f"--{name} holds {min(values)}, expected at least 1")
+    return options
+
+
+def main() -> None:
+    """Parse the options, measure, write."""
+    options = parse()
+    measures = {"simulator": simulator, "learner": learner, "train": training}
+    told = machine()
+    for part in PARTS:
+        if part in options.parts:
+            told |= measures[part](options)
+    told |= memory()
     if options.out is not None:
-        device = jax.devices()[0]
-        told = {
-            "command": " ".join(["experiments/benchmark.py", *sys.argv[1:]]),
-            "device": f"{device.platform} ({device.device_kind})",
-            "cpu_count": os.cpu_count(),
-            "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
-            "simulator": entries,
-        }
         write_json(options.out, told)
 
 

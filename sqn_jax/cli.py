@@ -29,6 +29,11 @@ TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
     "pairs": "random pairs",
 }
 
+CACHE = (
+    "Compiled programs are kept in the user's cache folder for the next start: SQN_JAX_CACHE=DIR "
+    "in the environment names another folder, SQN_JAX_CACHE=off keeps none."
+)
+
 USAGE = """usage: sqn COMMAND [OPTIONS]
 
   sqn train              train a robot, evaluate it, and draw what it did
@@ -121,7 +126,8 @@ def _parse_config(words: list[str], preset: str) -> TrainConfig:
     description = (
         "Train an agent, evaluate it, and draw what it did. Besides the options below: "
         f"--preset {{{','.join(PRESETS)}}} (default quick) chooses the defaults shown here, "
-        "--run-dir DIR where to write (default runs/NAME), --resume goes on with --run-dir."
+        "--run-dir DIR where to write (default runs/NAME), --resume goes on with --run-dir. "
+        f"{CACHE}"
     )
     told = io.StringIO()
     try:
@@ -183,6 +189,7 @@ def _evaluate(words: list[str]) -> int:
     parser = _Parser(
         prog="sqn evaluate",
         description="Drive greedy episodes of trained policies; every agent gets the same tasks.",
+        epilog=CACHE,
         allow_abbrev=False,
     )
     add = parser.add_argument

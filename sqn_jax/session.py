@@ -30,6 +30,7 @@ from sqn_jax.compare import (
     load_maps,
     num_episodes,
 )
+from sqn_jax.compilation import kept_programs, watched_compilation
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
@@ -56,6 +57,7 @@ class Stopped(Exception):
         self.exit_code = 128 + signal_number
 
 
+@kept_programs()
 def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> None:
     """Train, evaluate and draw, telling the terminal about it.
 
@@ -123,11 +125,14 @@ def _train(
     seconds_before: float,
 ) -> tuple[RunnerState, dict[str, float]]:
     """Drive the training to its end; returns the final state and how long it took."""
-    timing = {"compile_seconds": 0.0, "train_seconds": seconds_before, "env_steps": 0.0}
+    timing: dict[str, float] = {"train_seconds": seconds_before, "env_steps": 0.0}
     episodes_a_chunk = config.rounds_per_chunk * config.num_envs
     print("compiling ...", end="", flush=True)
-    program, timing["compile_seconds"] = compile_chunk(runner, env_params, config)
-    print(f"\rcompiled in {timing['compile_seconds']:.1f} s")
+    with watched_compilation() as was_read:
+        program, timing["compile_seconds"] = compile_chunk(runner, env_params, config)
+    timing["compiled_earlier"] = was_read()
+    how = "compiled earlier, read" if was_read() else "compiled"
+    print(f"\r{how} in {timing['compile_seconds']:.1f} s")
     last_saved = time.monotonic()
     rounds_done = int(np.max(np.asarray(runner.round)))
     total = config.num_rounds * config.num_envs
@@ -149,6 +154,7 @@ def _train(
     return runner, timing
 
 
+@kept_programs()
 def evaluate_session(
     agents: Sequence[Agent], settings: Settings, out: Path | None = None
 ) -> dict[str, Any]:
@@ -312,6 +318,7 @@ def _conclude(
         "episodes": config.num_rounds * config.num_envs,
         "wall_seconds": round(timing["train_seconds"], 1),
         "compile_seconds": round(timing["compile_seconds"], 1),
+        "compiled_earlier": bool(timing["compiled_earlier"]),
         "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
         "device": f"{device.platform} ({device.device_kind})",
         "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},

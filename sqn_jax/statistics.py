@@ -1,4 +1,8 @@
-"""Scores and intervals for what an evaluation measured. NumPy and SciPy, on the host."""
+"""Scores and intervals for what an evaluation measured. NumPy and SciPy, on the host.
+
+`scipy.stats` takes half a second to import, and training starts without it: it is imported where it
+is used.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -17,6 +20,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """
     if trials < 1:
         raise ValueError("an interval needs at least one trial")
+    from scipy import stats
+
     interval = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -44,6 +49,8 @@ def interquartile_mean(scores: ArrayLike) -> float:
     A quarter of the values, rounded down, is left out at each end; so few that none is, and it is
     the plain mean.
     """
+    from scipy import stats
+
     return float(stats.trim_mean(np.asarray(scores, np.float64).reshape(-1), 0.25))
 
 

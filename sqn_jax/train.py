@@ -267,9 +267,14 @@ ChunkProgram = Callable[[RunnerState, EnvParams], tuple[RunnerState, dict[str, A
 def compile_chunk(
     runner: RunnerState, env_params: EnvParams, config: TrainConfig
 ) -> tuple[ChunkProgram, float]:
-    """Compile `train_chunk` for states like `runner`; returns it and the seconds it took."""
+    """Compile `train_chunk` for states like `runner`; returns it and the seconds it took.
+
+    It is compiled from shapes: arrays from a checkpoint are bound to their device, and a program
+    made for those is not the one that a new run has compiled and kept.
+    """
     started = time.perf_counter()
-    program = compiled_train_chunk.lower(runner, env_params, config).compile()
+    shapes = jax.eval_shape(lambda *given: given, runner, env_params)
+    program = compiled_train_chunk.lower(*shapes, config).compile()
     return program, time.perf_counter() - started
 
 

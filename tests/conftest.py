@@ -1,4 +1,7 @@
-"""What holds for every test: the CPU, no silent broadcasting, the same examples in every run."""
+"""What holds for every test: the CPU, no silent broadcasting, the same examples in every run.
+
+Nor do tests read or write compiled programs in the user's cache folder.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,9 @@ import os
 # Before anything imports jax, and in the environment, so that child processes obey too.
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["JAX_ENABLE_X64"] = "0"
+os.environ["SQN_JAX_CACHE"] = "off"
+os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+os.environ.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
 
 import hypothesis
 import jax

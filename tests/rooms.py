@@ -1,7 +1,8 @@
-"""A small room, and weights that make robots do different things in it."""
+"""Small rooms, and weights that make robots do different things in it."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,6 +28,21 @@ def small_room(length: int, **changes: Any) -> EnvParams:
     corners = np.array([[0.65, 0.65], [3.35, 0.65], [0.65, 2.35], [3.35, 2.35]])
     room = OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=length)
     return make_env(room, EnvConfig(**changes))
+
+
+def write_empty_room(folder: Path) -> Path:
+    """A map file of 5 x 4 m with walls around; returns its name."""
+    cells = np.full((40, 50), 254, np.uint8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 0
+    (folder / "room.pgm").write_bytes(b"P5\n50 40\n255\n" + cells.tobytes())
+    path = folder / "room.yaml"
+    path.write_text(
+        "image: room.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        "spawn_points: [[0.8, 0.8], [4.2, 3.2], [0.8, 3.2]]\n"
+        "evaluation_points: [[0.8, 0.8], [4.2, 3.2]]\n"
+    )
+    return path
 
 
 def random_params(network: QNetwork, env_params: EnvParams, seed: int = 0) -> Any:

@@ -48,7 +48,9 @@ ARROWS: dict[str, set[str]] = {
     "rollout": {"config", "env", "agent"},
     **{room: RUN_LAYER | DEVICE_LAYER | {"maps"} for room in RUN_LAYER},
     "sqn_jax": RUN_LAYER | DEVICE_LAYER | {"maps"},
-    "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
+    # Known to session only: who imports the library gets no cache on disk.
+    "compilation": {"runlog"},
+    "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax", "compilation"},
     "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
     "__main__": {"cli"},
     "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
@@ -68,7 +70,10 @@ QUIET_CALLS = {
 DEVICE_LIBRARIES = {"chex", "flax", "jax", "jaxlib", "optax", "orbax"}
 PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING_ROOMS = {"figures", "render"}
-JIT_MODULES = {"sqn_jax.train", "sqn_jax.evaluate", "experiments.benchmark"}
+JIT_MODULES = {
+    *("sqn_jax.train", "sqn_jax.evaluate"),
+    *("experiments.bench_simulator", "experiments.bench_learner"),
+}
 JIT_NAMES = {"jit", "pjit", "pmap"}
 UNSAFE_IMPORTS = {
     *("cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"),
@@ -250,9 +255,11 @@ CLEAN_TREE = {
     "sqn_jax/agent/loss.py": "import jax\nfrom sqn_jax.config import LearnerConfig\n",
     "sqn_jax/rollout.py": "from sqn_jax.agent import loss\nfrom sqn_jax.env import step\n",
     "sqn_jax/train.py": "import time\nimport jax\nfrom sqn_jax import rollout\nx = jax.jit(abs)\n",
+    "sqn_jax/compilation.py": "import os\nimport jax\n",
+    "sqn_jax/session.py": "from sqn_jax import compilation, train\n",
     "sqn_jax/evaluate.py": "from jax import jit\nfrom sqn_jax.rollout import unroll\n",
     "sqn_jax/figures.py": "def draw():\n    from matplotlib import pyplot\n",
-    "experiments/benchmark.py": "import jax\nimport sqn_jax\njax.jit(abs)\n",
+    "experiments/bench_learner.py": "import jax\nimport sqn_jax\njax.jit(abs)\n",
 }
 LONG_FILE = "x = 1\n" * (MAX_FILE_LINES + 1)
 LONG_FUNCTION = "def f():\n" + "    x = 1\n" * MAX_FUNCTION_LINES
@@ -274,6 +281,8 @@ FAULTS = [
     ("sqn_jax/rollout.py", "from sqn_jax.maps import ros", "rollout may not import sqn_jax.maps"),
     ("sqn_jax/config.py", "from sqn_jax.env import step", "config may not import sqn_jax.env"),
     ("sqn_jax/train.py", "from sqn_jax.cli import main", "train may not import sqn_jax.cli"),
+    ("sqn_jax/train.py", "from sqn_jax import compilation", "train may not import sqn_jax.compil"),
+    ("sqn_jax/cli.py", "from sqn_jax import compilation", "cli may not import sqn_jax.compil"),
     ("sqn_jax/cli.py", "from experiments import benchmark", "cli may not import experiments"),
     ("sqn_jax/maps/ros.py", "from sqn_jax.env import step", "maps may not import sqn_jax.env"),
     ("sqn_jax/maps/ros.py", "import jax.numpy as jnp", "maps is host-only and may not import jax"),
@@ -285,7 +294,7 @@ FAULTS = [
     ("sqn_jax/rollout.py", "import jax\nf = jax.jit(abs)", "jit belongs in"),
     ("sqn_jax/agent/loss.py", "import jax\n@jax.jit\ndef f(): ...", "jit belongs in"),
     ("sqn_jax/agent/loss.py", "from jax import jit as fast", "jit belongs in"),
-    ("experiments/ablations.py", "import jax\nf = jax.jit(abs)", "jit belongs in"),
+    ("experiments/benchmark.py", "import jax\nf = jax.jit(abs)", "jit belongs in"),
     ("sqn_jax/env/geometry.py", "print(1)", "env does no I/O and may not call print"),
     ("sqn_jax/env/geometry.py", "import jax\njax.debug.print('x')", "may not call print"),
     ("sqn_jax/agent/loss.py", "open('x')", "agent does no I/O and may not call open"),

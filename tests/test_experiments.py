@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from experiments import benchmark, common, robustness, table1
+from experiments import bench_simulator, benchmark, common, robustness, table1
 from sqn_jax.compare import Settings
 
 TOLD = {"mean": 0.5, "std": 0.5, "ci95": [0.4, 0.6], "std_of_means": 0.025}
@@ -70,22 +70,48 @@ def test_both_scripts_at_a_tiny_budget(
     assert (tmp_path / "runs" / "robustness.png").stat().st_size > 10_000
 
 
-def test_the_benchmark_times_every_program_and_writes_what_it_prints(
+def test_the_benchmark_times_every_simulator_and_writes_what_it_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--maps", "maze", "--envs", "2", "3", "--steps", "4", "--repeats", "3"]
-    call(benchmark.main, [*words, "--out", str(tmp_path / "speed.json")], monkeypatch)
+    words = ["--parts", "simulator", "--maps", "maze", "--envs", "2", "3", "--steps", "4"]
+    words += ["--repeats", "3", "--out", str(tmp_path / "speed.json")]
+    call(benchmark.main, words, monkeypatch)
     found = json.loads((tmp_path / "speed.json").read_text())
+    assert found["command"] == " ".join(["experiments/benchmark.py", *words])
+    assert "learner" not in found
+    assert found["cpu"]
     ours = [entry for entry in found["simulator"] if entry["program"] == "sqn_jax, maze"]
     assert [entry["num_envs"] for entry in ours] == [2, 3]
     printed = capsys.readouterr().out
     for entry in ours:
         assert 0 < entry["slowest"] <= entry["steps_per_second"] <= entry["fastest"]
         assert f"{entry['steps_per_second']:,}" in printed
+    # 401 observations of 71 bytes and 2 x 2, 400 actions, rewards and ends of 6, a priority of 4.
+    assert found["memory"]["replay_bytes"] == 10_000 * (401 * 75 + 400 * 6 + 4) + 12
+    assert "10,000 episodes" in printed
+    has_jaxnav = "jaxmarl" in found["versions"]
+    assert ("jaxmarl is not installed" in printed) is not has_jaxnav
+    assert any(entry["program"] == "JaxNav" for entry in found["simulator"]) is has_jaxnav
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--steps", "0"], "--steps is 0"),
+        (["--envs", "64", "0"], "--envs holds 0"),
+        (["--torch-threads", "-1"], "--torch-threads holds -1"),
+    ],
+)
+def test_a_benchmark_of_nothing_is_refused(
+    words: list[str],
+    fault: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(SystemExit) as stopped:
-        call(benchmark.main, ["--steps", "0"], monkeypatch)
+        call(benchmark.main, words, monkeypatch)
     assert stopped.value.code == 2
-    assert "--steps is 0" in capsys.readouterr().err
+    assert fault in capsys.readouterr().err
 
 
 def test_a_benchmark_is_told_in_times_of_jaxnav_with_as_many_robots() -> None:
@@ -94,7 +120,7 @@ def test_a_benchmark_is_told_in_times_of_jaxnav_with_as_many_robots() -> None:
         {"program": "sqn_jax, maze", "num_envs": 256, "steps_per_second": 500_000},
         {"program": "JaxNav", "num_envs": 64, "steps_per_second": 40_000},
     ]
-    rows = benchmark.table(entries).splitlines()[2:]
+    rows = bench_simulator.table(entries).splitlines()[2:]
     assert [row.split("|")[-2].strip() for row in rows] == ["7.5", "-", "1.0"]
 
 

@@ -42,9 +42,19 @@ class GRU(nn.Module):
         input_bias = self.param("input_bias", nn.initializers.zeros, (3 * size,))
         hidden_kernel = self.param("hidden_kernel", _orthogonal_gates, (size, 3 * size))
         candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (size,))
-        projected = inputs @ input_kernel + jnp.expand_dims(input_bias, (0, 1))
+        projected = multiply(inputs, input_kernel) + jnp.expand_dims(input_bias, (0, 1))
         hidden = scan_gru(projected, carry, hidden_kernel, candidate_bias)
         return hidden[-1], hidden
+
+
+def multiply(inputs: Array, kernel: Array) -> Array:
+    """Matrix product of [..., D] and [D, E], as one of two dimensions.
+
+    The gradient of the kernel sums over all leading axes; over more than one at once, XLA's CPU
+    backend copies both operands into another order first.
+    """
+    flat = inputs.reshape(-1, inputs.shape[-1]) @ kernel
+    return flat.reshape(*inputs.shape[:-1], kernel.shape[-1])
 
 
 def _orthogonal_gates(key: Array, shape: tuple[int, int]) -> Array:
@@ -135,7 +145,7 @@ def _backward(
     )
     size = carry.shape[-1]
     to_projected = jnp.concatenate([to_recurrent[..., : 2 * size], to_candidate], axis=-1)
-    kernel_gradient = jnp.einsum("tbh,tbg->hg", previous, to_recurrent)
+    kernel_gradient = previous.reshape(-1, size).T @ to_recurrent.reshape(-1, 3 * size)
     bias_gradient = to_recurrent[..., 2 * size :].sum(axis=(0, 1))
     return to_projected, carry_gradient, kernel_gradient, bias_gradient
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.gru import GRU
+from sqn_jax.agent.gru import GRU, multiply
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -194,7 +194,7 @@ class _Dense(nn.Module):
         initializer = nn.initializers.variance_scaling(self.scale**2, "fan_in", "truncated_normal")
         kernel = self.param("kernel", initializer, (inputs.shape[-1], self.size))
         bias = self.param("bias", _uniform_bias(inputs.shape[-1], self.scale), (self.size,))
-        return inputs @ kernel + jnp.expand_dims(bias, tuple(range(inputs.ndim - 1)))
+        return multiply(inputs, kernel) + jnp.expand_dims(bias, tuple(range(inputs.ndim - 1)))
 
 
 def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:

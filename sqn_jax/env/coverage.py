@@ -183,7 +183,7 @@ def _sectors(heading: Array, reaches: Array, field_of_view: float) -> Array:
     above = jnp.where(sines > 1e-6, crossings, -FAR)
     below = jnp.where(sines < -1e-6, crossings, -FAR)
     table = jnp.concatenate([above, below, reaches * reaches, jnp.full(1, -1.0)])
-    angles = np.array([[0.0], [np.pi]], np.float32) - heading
+    angles = jnp.array([[0.0], [np.pi]]) - heading
     sector = _sector_at(angles, blind, field_of_view) + np.arange(most, dtype=np.int32)[None]
     following = sector + 1
     sector = jnp.where(sector > blind, sector - (blind + 1), sector)

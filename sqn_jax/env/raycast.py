@@ -22,7 +22,7 @@ class RayGrid:
 
     far_sides: Array
     """[H * W * sectors] int16, where the free rectangle of a cell ends; 0 in the first sector of a
-    blocked cell. The sectors of a cell lie together: most beams of a robot start in the same one."""
+    blocked cell. The sectors of a cell lie together: a robot's beams start in one cell."""
     resolution: Array
     """m per cell."""
     height: int = struct.field(pytree_node=False)

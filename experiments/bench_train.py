@@ -1,0 +1,92 @@
+"""The whole compiled training program of a preset, and what a run takes of memory."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from typing import Any
+
+import jax
+
+from experiments.timing import Timing, four_digits
+from sqn_jax import train
+from sqn_jax.agent import r2d2, replay
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import EnvParams
+from sqn_jax.scores import markdown_table
+
+
+def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[str, Any]:
+    """Time calls of `train_chunk`, rollouts and updates together, once updates have begun.
+
+    Args:
+        config: the run.
+        env_params: its world.
+        repeats: calls that are timed.
+
+    Returns:
+        Steps and updates a second (of all seeds), slowest and fastest steps a second, seconds to
+        compile and of the first call.
+    """
+    runner = train.start_run(env_params, config)
+    program, compile_seconds = train.compile_chunk(runner, env_params, config)
+    warm_up = 0.0
+    seconds: list[float] = []
+    updates = 0
+    while len(seconds) < repeats:
+        started = time.perf_counter()
+        runner, metrics = program(runner, env_params)
+        jax.block_until_ready((runner, metrics))
+        lasted = time.perf_counter() - started
+        if updates:
+            seconds.append(lasted)
+        warm_up = warm_up or lasted
+        updates = int(metrics["updates"].max())
+    timing = Timing(warm_up, tuple(seconds))
+    rounds = config.rounds_per_chunk * config.num_seeds
+    steps = rounds * config.num_envs * env_params.max_steps
+    updates_a_chunk = rounds * train.updates_a_round(config, env_params)
+    return {
+        "algo": config.algo,
+        "method": config.method,
+        "map": config.map,
+        "num_envs": config.num_envs,
+        "steps_per_chunk": steps,
+        **timing.rates(steps, unit="steps_per_second"),
+        "updates_per_second": four_digits(updates_a_chunk / timing.median),
+        "compile_seconds": round(compile_seconds, 2),
+    }
+
+
+def memory(config: TrainConfig, env_params: EnvParams) -> dict[str, int]:
+    """Bytes: the peak of this process so far, and what a run with this config keeps.
+
+    `replay_bytes` is the replay (0 without one), `run_bytes` adds the episodes of one round.
+    """
+    item = r2d2.packed_item(train.episode_shapes(config, env_params))
+    has_replay = config.method == "r2d2"
+    capacity = config.replay.capacity if has_replay else 0
+    return {
+        "peak_process_bytes": peak_bytes(),
+        "replay_episodes": capacity,
+        "replay_bytes": replay.num_bytes(item, capacity) if has_replay else 0,
+        "run_bytes": train.memory_bytes(config, env_params),
+    }
+
+
+def peak_bytes() -> int:
+    """The most memory that this process has held so far, bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # Elsewhere it counts KiB.
+
+
+def table(entries: dict[str, dict[str, Any]]) -> str:
+    """One row a preset."""
+    rows = []
+    for preset, entry in entries.items():
+        row = [preset, entry["algo"], entry["method"], str(entry["num_envs"])]
+        row += [f"{entry['steps_per_second']:,}", f"{entry['updates_per_second']:.3g}"]
+        rows.append([*row, f"{entry['compile_seconds']:.1f}"])
+    header = ["preset", "agent", "method", "robots", "steps a second", "updates a second"]
+    return markdown_table([*header, "seconds to compile"], rows)
