@@ -22,19 +22,26 @@ from sqn_jax.scores import markdown_table
 @partial(jax.jit, static_argnames=("num_envs", "num_steps"))
 def drive_ours(key: Array, params: EnvParams, num_envs: int, num_steps: int) -> Any:
     """Observations and rewards of robots with random actions."""
-    start_key, drive_key = jax.random.split(key)
+    start_key, action_key, step_key = jax.random.split(key, 3)
     _, states = jax.vmap(reset, in_axes=(0, None))(jax.random.split(start_key, num_envs), params)
 
-    def body(states: Any, key: Array) -> tuple[Any, Any]:
-        action_key, step_key = jax.random.split(key)
-        actions = jax.random.randint(action_key, (num_envs,), 0, NUM_ACTIONS)
-        keys = jax.random.split(step_key, num_envs)
+    def body(states: Any, chance: tuple[Array, Array]) -> tuple[Any, Any]:
+        actions, keys = chance
         obs, states, reward, _, _, info = jax.vmap(step, in_axes=(0, 0, 0, None))(
             keys, states, actions, params
         )
         return states, (obs, reward, info["reached"])
 
-    return jax.lax.scan(body, states, jax.random.split(drive_key, num_steps))[1]
+    return jax.lax.scan(body, states, draw_chance(action_key, step_key, num_steps, num_envs))[1]
+
+
+def draw_chance(
+    action_key: Array, step_key: Array, num_steps: int, num_envs: int
+) -> tuple[Array, Array]:
+    """Random actions and keys for the steps, [T, N] each; drawn alike for both simulators."""
+    shape = (num_steps, num_envs)
+    actions = jax.random.randint(action_key, shape, 0, NUM_ACTIONS)
+    return actions, jax.random.split(step_key, shape)
 
 
 def ours(params: EnvParams, num_envs: int, num_steps: int) -> Program:
@@ -53,17 +60,15 @@ def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
 
     @jax.jit
     def drive(key: Array) -> Any:
-        start_key, drive_key = jax.random.split(key)
+        start_key, action_key, step_key = jax.random.split(key, 3)
         _, states = jax.vmap(world.reset)(jax.random.split(start_key, num_envs))
 
-        def body(states: Any, key: Array) -> tuple[Any, Any]:
-            action_key, step_key = jax.random.split(key)
-            actions = {"agent_0": jax.random.randint(action_key, (num_envs,), 0, NUM_ACTIONS)}
-            keys = jax.random.split(step_key, num_envs)
-            obs, states, reward, *_ = jax.vmap(advance)(keys, states, actions)
+        def body(states: Any, chance: tuple[Array, Array]) -> tuple[Any, Any]:
+            actions, keys = chance
+            obs, states, reward, *_ = jax.vmap(advance)(keys, states, {"agent_0": actions})
             return states, (obs["agent_0"], reward["agent_0"])
 
-        return jax.lax.scan(body, states, jax.random.split(drive_key, num_steps))[1]
+        return jax.lax.scan(body, states, draw_chance(action_key, step_key, num_steps, num_envs))[1]
 
     return lambda turn: drive(jax.random.key(turn))
 

