@@ -1,12 +1,13 @@
 """How fast simulator, learner and training are, beside other programs where those are installed.
 
-    .venv/bin/python experiments/benchmark.py [--parts simulator learner train] [--out FILE]
+    .venv/bin/python experiments/benchmark.py [--parts simulator learner ...] [--out FILE]
 
 `simulator`: steps a second with random actions, beside JaxNav (`bench_simulator.py`). `learner`:
 R2D2 updates of the preset `paper`, beside PyTorch and beside the machine's rate of matrix products
-(`bench_learner.py`). `train`: the compiled training program of a preset (`bench_train.py`). What is
-compared takes turns; told are medians. `.venv/bin/python -m pip install -e ".[bench]"` installs
-JaxNav and PyTorch.
+(`bench_learner.py`). `train`: the compiled training program of a preset (`bench_train.py`).
+`breakdown`: the pieces of a step and of a training window (`bench_breakdown.py`). What is compared
+takes turns; told are medians. `.venv/bin/python -m pip install -e ".[bench]"` installs JaxNav and
+PyTorch.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from typing import Any
 import jax
 
 import sqn_jax
-from experiments import bench_learner, bench_simulator, bench_train
+from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import ALGORITHMS, run
 from sqn_jax.env import make_env
 from sqn_jax.presets import PRESETS
 from sqn_jax.runlog import write_json
 
-PARTS = ("simulator", "learner", "train")
+PARTS = ("simulator", "learner", "train", "breakdown")
 
 
 def simulator(options: argparse.Namespace) -> dict[str, Any]:
@@ -69,6 +70,15 @@ def training(options: argparse.Namespace) -> dict[str, Any]:
         entries[preset] = bench_train.measure(config, env_params, options.repeats)
     print(bench_train.table(entries), end="\n\n")
     return {"train": entries}
+
+
+def breakdown(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure and print where the time of a step and of a training window goes."""
+    config = PRESETS["quick"]
+    env_params = make_env(config.map, config.env)
+    entries = bench_breakdown.measure(config, env_params, options.steps, options.repeats)
+    print(bench_breakdown.table(entries), end="\n\n")
+    return {"breakdown": entries}
 
 
 def memory() -> dict[str, Any]:
@@ -145,7 +155,12 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     """Parse the options, measure, write."""
     options = parse()
-    measures = {"simulator": simulator, "learner": learner, "train": training}
+    measures = {
+        "simulator": simulator,
+        "learner": learner,
+        "train": training,
+        "breakdown": breakdown,
+    }
     told = machine()
     for part in PARTS:
         if part in options.parts:

@@ -72,7 +72,7 @@ PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING_ROOMS = {"figures", "render"}
 JIT_MODULES = {
     *("sqn_jax.train", "sqn_jax.evaluate"),
-    *("experiments.bench_simulator", "experiments.bench_learner"),
+    *("experiments.bench_simulator", "experiments.bench_learner", "experiments.bench_breakdown"),
 }
 JIT_NAMES = {"jit", "pjit", "pmap"}
 UNSAFE_IMPORTS = {

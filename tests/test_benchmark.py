@@ -17,12 +17,12 @@ import pytest
 from compiling import compiling_quickly
 from rooms import small_room
 
-from experiments import bench_learner, bench_train, operations, timing
+from experiments import bench_breakdown, bench_learner, bench_train, operations, timing
 from sqn_jax.agent import Episodes, make_network, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, make_optimizer
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
-from sqn_jax.env import Observation
+from sqn_jax.env import Observation, navigation
 from sqn_jax.presets import PRESETS
 
 LENGTH, BATCH, BEAMS, ACTIONS = 9, 3, 4, 5
@@ -322,6 +322,35 @@ def test_the_learner_is_timed_for_every_agent_and_program() -> None:
     assert found["sqn", "JAX"]["operations"] > found["dqn", "JAX"]["operations"]
     if threads:
         assert told["torch_td_error_difference"] < 1e-4
+
+
+def test_the_pieces_of_a_step_add_up_to_the_step_itself() -> None:
+    """Not in time, which is noisy, but in what they do: each leaves the robot where a step does."""
+    room = small_room(12)
+    start, action_key = jax.random.split(jax.random.key(3))
+    _, state = navigation.reset(start, room)
+    for action in jax.random.randint(action_key, (12,), 0, 5):
+        ends = {name: piece(state, action, room) for name, piece in bench_breakdown.PIECES.items()}
+        state, (obs, _) = ends["whole step"]
+        for name in ("motion", "motion, rays", "motion, rays, coverage"):
+            np.testing.assert_allclose(ends[name][0].pose, state.pose, atol=1e-6)
+        drawn, (ranges, _) = ends["motion, rays, coverage"]
+        np.testing.assert_array_equal(drawn.covered, state.covered)
+        np.testing.assert_allclose(ends["motion, rays"][1] / 5.0, obs.ranges, atol=1e-6)
+        np.testing.assert_allclose(ranges / 5.0, obs.ranges, atol=1e-6)
+
+
+def test_the_breakdown_tells_of_every_piece_and_of_both_halves_of_a_window() -> None:
+    config = dataclasses.replace(PRESETS["smoke"], network=SIZES, num_envs=8)
+    with compiling_quickly():
+        entries = bench_breakdown.measure(config, small_room(30), 5, 2)
+    assert [entry["piece"] for entry in entries] == [
+        *bench_breakdown.PIECES,
+        *("drive a window", "learn from a window"),
+    ]
+    for entry in entries:
+        assert 0 < entry["fastest"] <= entry["microseconds"] <= entry["slowest"]
+    assert len(bench_breakdown.table(entries).splitlines()) == 2 + len(entries)
 
 
 def test_pytorch_at_its_best_is_what_the_learner_is_told_in_times_of() -> None:

@@ -1,0 +1,149 @@
+"""Where the time goes: the pieces of a simulator's step, the halves of a training window."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from experiments.bench_simulator import draw_chance
+from experiments.timing import Program, four_digits, time_in_turns
+from sqn_jax import train
+from sqn_jax.agent import pqn
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
+from sqn_jax.env.dynamics import move
+from sqn_jax.rollout import start_fleet, unroll
+from sqn_jax.scores import markdown_table
+
+Piece = Callable[[EnvState, Array, EnvParams], tuple[EnvState, Any]]
+"""One part of a step of one robot: state, action and world to the next state and a result."""
+
+
+def whole_step(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
+    """All of it, as the benchmark of the simulator has it."""
+    obs, state, reward, *_ = navigation.step(jax.random.key(0), state, action, params)
+    return state, (obs, reward)
+
+
+def motion(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
+    """Only drive, with the collision check."""
+    pose, refused = move(
+        state.pose,
+        params.commands[action],
+        params.body,
+        time_step=params.time_step,
+        iterations=navigation.MOTION_ITERATIONS,
+    )
+    return dataclasses.replace(state, pose=pose), refused
+
+
+def rays(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
+    """Drive and look."""
+    state, _ = motion(state, action, params)
+    return state, true_ranges(state.pose, params)
+
+
+def rays_and_coverage(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
+    """Drive, look, and mark what is seen."""
+    state, ranges = rays(state, action, params)
+    covered, fresh = coverage.add_scan(
+        state.covered,
+        state.pose,
+        ranges,
+        field_of_view=navigation.field_of_view(params),
+        lattice=params.lattice,
+    )
+    return dataclasses.replace(state, covered=covered), (ranges, fresh)
+
+
+PIECES: dict[str, Piece] = {
+    "motion": motion,
+    "motion, rays": rays,
+    "motion, rays, coverage": rays_and_coverage,
+    "whole step": whole_step,
+}
+
+
+def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int) -> Program:
+    """A piece for N robots with random actions, T steps in one compiled scan."""
+    start_key, action_key, step_key = jax.random.split(jax.random.key(0), 3)
+    _, states = jax.jit(jax.vmap(navigation.reset, in_axes=(0, None)))(
+        jax.random.split(start_key, num_envs), params
+    )
+    actions, _ = draw_chance(action_key, step_key, num_steps, num_envs)
+
+    @jax.jit
+    def drive(states: EnvState, actions: Array, params: EnvParams) -> Any:
+        one = jax.vmap(piece, in_axes=(0, 0, None))
+        return jax.lax.scan(lambda states, action: one(states, action, params), states, actions)
+
+    return lambda turn: drive(states, actions, params)
+
+
+def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program]:
+    """The two halves of a window of recurrent PQN: drive it, learn from it."""
+    network = train.network_of(config)
+    runner = train.start_run(params, config)
+    key = jax.random.key(1)
+    fleet = jax.jit(lambda key, params: start_fleet(key, config.num_envs, network, params))(
+        key, params
+    )
+    num_steps = params.max_steps // train.num_windows(config, params)
+    epsilon = jnp.zeros(config.num_envs)
+
+    @jax.jit
+    def drive(learner: Any, fleet: Any, params: EnvParams) -> Any:
+        return unroll(key, network, learner.params, fleet, epsilon, params, num_steps=num_steps)[1]
+
+    optimizer = train.optimizer_of(config, params)
+
+    @jax.jit
+    def learn(learner: Any, episodes: Any) -> Any:
+        return pqn.learn(key, learner, None, episodes, network, optimizer, config)[0]
+
+    episodes = drive(runner.learner, fleet, params)
+    return {
+        "drive a window": lambda turn: drive(runner.learner, fleet, params),
+        "learn from a window": lambda turn: learn(runner.learner, episodes),
+    }
+
+
+def measure(
+    config: TrainConfig, params: EnvParams, num_steps: int, repeats: int
+) -> list[dict[str, Any]]:
+    """Microseconds a robot and step of each piece; all take turns.
+
+    Args:
+        config: a run by the method `pqn`; its robots are those of all pieces.
+        params: its world.
+        num_steps: steps of the simulator's pieces in one call.
+        repeats: turns.
+    """
+    programs: dict[str, Program] = {
+        name: piece_program(piece, params, config.num_envs, num_steps)
+        for name, piece in PIECES.items()
+    }
+    windows = window_programs(config, params)
+    window_steps = params.max_steps // train.num_windows(config, params)
+    timings = time_in_turns(programs | windows, repeats)
+    entries = []
+    for name, timing in timings.items():
+        steps = config.num_envs * (window_steps if name in windows else num_steps)
+        microseconds = {
+            "microseconds": four_digits(timing.median / steps * 1e6),
+            "fastest": four_digits(min(timing.seconds) / steps * 1e6),
+            "slowest": four_digits(max(timing.seconds) / steps * 1e6),
+        }
+        entries.append({"piece": name, "num_envs": config.num_envs} | microseconds)
+    return entries
+
+
+def table(entries: list[dict[str, Any]]) -> str:
+    """Microseconds a robot and step."""
+    rows = [[entry["piece"], f"{entry['microseconds']:.2f}"] for entry in entries]
+    return markdown_table(["piece", "us a robot and step"], rows)

@@ -1,0 +1,55 @@
+"""The linear layer against NumPy in double precision, and its derivative against differences."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from sqn_jax.agent.linear import affine, sum_rows
+
+
+def arrays(*leading: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(len(leading))
+    return rng.normal(size=(*leading, 4)), rng.normal(size=(4, 3)), rng.normal(size=3)
+
+
+@pytest.mark.parametrize("leading", [(), (5,), (2, 5), (3, 2, 5)])
+def test_it_is_a_product_and_a_sum_whatever_the_leading_axes(leading: tuple[int, ...]) -> None:
+    inputs, kernel, bias = arrays(*leading)
+    got = affine(*(jnp.asarray(x, jnp.float32) for x in (inputs, kernel, bias)))
+    np.testing.assert_allclose(got, inputs @ kernel + bias, atol=1e-5)
+
+
+def test_its_derivative_is_that_of_the_formula() -> None:
+    """d/dX = G K', d/dK = X' G and d/db = 1' G over all rows, in double precision by NumPy."""
+    inputs, kernel, bias = arrays(3, 2)
+    weights = np.random.default_rng(9).normal(size=(3, 2, 3))
+
+    def loss(*given: Array) -> Array:
+        return (affine(*given) * jnp.asarray(weights, jnp.float32)).sum()
+
+    singles = (jnp.asarray(x, jnp.float32) for x in (inputs, kernel, bias))
+    to_inputs, to_kernel, to_bias = jax.grad(loss, argnums=(0, 1, 2))(*singles)
+    np.testing.assert_allclose(to_inputs, weights @ kernel.T, atol=1e-5)
+    np.testing.assert_allclose(to_kernel, np.einsum("abd,abe->de", inputs, weights), atol=1e-5)
+    np.testing.assert_allclose(to_bias, weights.sum(axis=(0, 1)), atol=1e-5)
+
+
+def test_several_seeds_side_by_side_have_the_derivatives_of_each_alone() -> None:
+    inputs, kernel, bias = (
+        jnp.asarray(np.stack([x, 2 * x - 1]), jnp.float32) for x in arrays(3, 2)
+    )
+    gradient = jax.grad(lambda k, b, x: (affine(x, k, b) ** 2).sum(), argnums=(0, 1))
+    together = jax.vmap(gradient)(kernel, bias, inputs)
+    for seed in range(2):
+        alone = gradient(kernel[seed], bias[seed], inputs[seed])
+        for one, many in zip(alone, together, strict=True):
+            np.testing.assert_allclose(many[seed], one, rtol=1e-4)
+
+
+def test_rows_are_summed() -> None:
+    rows = jnp.arange(12.0).reshape(4, 3)
+    assert sum_rows(rows).tolist() == [0 + 3 + 6 + 9, 1 + 4 + 7 + 10, 2 + 5 + 8 + 11]
