@@ -61,7 +61,7 @@ class EnvConfig:
     ray_sectors: int = 32
     """Directions in the free-space table of the ray caster; a multiple of 4."""
     ray_iterations: int = 8
-    """Free rectangles a ray may cross before it is cut short, at most; a map may need fewer."""
+    """Free rectangles a ray may cross before its reading is cut short."""
     velocity_noise: float = 0.0
     """Sigma of Gaussian noise on the executed velocity."""
     velocity_noise_unit: Literal["relative", "absolute"] = "relative"

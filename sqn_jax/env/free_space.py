@@ -76,41 +76,6 @@ def far_sides(rectangles: NDArray[np.uint16]) -> NDArray[np.int16]:
     return (sides[0] & 255) | (sides[1] << 8)
 
 
-def hops_needed(sides: NDArray[np.int16], reach: float, at_most: int) -> int:
-    """How many rectangles rays of a map cross before they end, all but one in two thousand.
-
-    Found by casting rays from random places in random directions, the same ones at every call: an
-    open map needs fewer hops than one with many small obstacles.
-
-    Args:
-        sides: [sectors, H, W] from `far_sides`.
-        reach: the longest reading, cells.
-        at_most: 1 or more, returned where more would be needed.
-
-    Returns:
-        1 to `at_most`.
-    """
-    rng = np.random.default_rng(0)
-    free = np.argwhere(sides[0] != 0)
-    cells = free[rng.integers(0, len(free), 20_000)]
-    y, x = (cells + rng.uniform(0.01, 0.99, cells.shape)).T
-    turns = rng.uniform(0, 1, len(cells))
-    sector = (turns * len(sides)).astype(np.int64)
-    cosines, sines = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
-    travelled = np.zeros(len(cells))
-    for hops in range(at_most):
-        column = np.floor(x + cosines * (travelled + 1e-3)).astype(np.int64)
-        row = np.floor(y + sines * (travelled + 1e-3)).astype(np.int64)
-        there = sides[sector, row, column].astype(np.int64)
-        across = (column + (there << 56 >> 56) - x) / cosines
-        along = (row + (there >> 8) - y) / sines
-        farther = np.maximum(travelled, np.minimum(np.minimum(across, along), reach))
-        if np.mean(farther > travelled + 1e-6) <= 1 / 2000:
-            return max(hops, 1)
-        travelled = farther
-    return at_most
-
-
 class _Sums:
     """Summed-area table of a blocked map, padded with blocked cells beyond the far sides."""
 

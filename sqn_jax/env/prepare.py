@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sqn_jax.config import EnvConfig
 from sqn_jax.env.arithmetic import LARGEST_INTEGER
 from sqn_jax.env.coverage import Lattice
-from sqn_jax.env.free_space import far_sides, free_rectangles, hops_needed
+from sqn_jax.env.free_space import far_sides, free_rectangles
 from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
@@ -74,8 +74,6 @@ def make_env(
     sight = _ray_grid(
         occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
     )
-    sides = np.moveaxis(np.asarray(sight.far_sides).reshape(sight.height, sight.width, -1), -1, 0)
-    reach = config.max_range / occupancy_map.resolution
     return EnvParams(
         sight=sight,
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
@@ -102,7 +100,7 @@ def make_env(
         ),
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
-        ray_iterations=hops_needed(sides, reach, config.ray_iterations),
+        ray_iterations=config.ray_iterations,
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
     )
 

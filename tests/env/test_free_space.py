@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
-from grid_oracle import open_map, random_map, wrap_map
+from grid_oracle import open_map
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sqn_jax.config import EnvConfig
-from sqn_jax.env import make_env
 from sqn_jax.env.free_space import far_sides, free_rectangles
-from sqn_jax.env.raycast import cast_rays
-from sqn_jax.maps import sample_spawn_points
 
 QUADRANTS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # (step in rows, step in columns)
 
@@ -111,33 +106,3 @@ def test_a_blocked_cell_has_its_near_sides_and_is_zero_in_the_first_sector_alone
     longest = far_sides(np.full((4, 1, 1), 127 + 256 * 127, np.uint16)).reshape(4)
     assert (longest[0] & 255, longest[0] >> 8) == (127, 127)
     assert ((longest[2] << 8).astype(np.int16) >> 8, longest[2] >> 8) == (-126, -126)
-
-
-def test_the_hops_needed_are_those_after_which_readings_hardly_change() -> None:
-    """Counted anew with the simulator's own rays, in an open room and among pillars."""
-    pillars = random_map(seed=3, rows=160, columns=240, blocks=10, pillars=150)
-    needed = []
-    for occupied in (open_map(160, 240), pillars):
-        points = sample_spawn_points(occupied, 0.05, 0.1, 2)
-        params = make_env(wrap_map(occupied, points), EnvConfig(ray_iterations=40))
-        needed.append(params.ray_iterations)
-        rng = np.random.default_rng(8)
-        cells = rng.permutation(np.argwhere(~occupied))[:3000, ::-1]
-        places = np.float32((cells + rng.uniform(0.01, 0.99, (3000, 2))) * 0.05)
-        angles = np.float32(rng.uniform(-np.pi, np.pi, (3000, 10)))
-        readings = [
-            np.asarray(
-                jax.vmap(
-                    lambda at, turn, hops=hops, grid=params.sight: cast_rays(
-                        grid, at, turn, max_range=5.0, iterations=hops
-                    )
-                )(places, angles)
-            )
-            for hops in (needed[-1] - 2, needed[-1], 60)
-        ]
-        cut_short = [np.mean(readings[2] - reading > 1e-4) for reading in readings[:2]]
-        assert cut_short[1] < 1 / 1000
-        assert cut_short[0] > 1 / 4000
-    assert needed[0] < needed[1]
-    capped = make_env(wrap_map(pillars, points), EnvConfig(ray_iterations=3))
-    assert capped.ray_iterations == 3
