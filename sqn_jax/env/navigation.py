@@ -160,7 +160,7 @@ def true_ranges(pose: Array, params: EnvParams) -> Array:
         pose,
         beams,
         max_range=params.config.max_range,
-        iterations=params.ray_iterations,
+        iterations=params.config.ray_iterations,
     )
 
 

@@ -48,8 +48,6 @@ class EnvParams:
     """The static settings this was made from."""
     max_steps: int = struct.field(pytree_node=False)
     """Steps an episode."""
-    ray_iterations: int = struct.field(pytree_node=False)
-    """Free rectangles a ray may cross before its reading is cut short."""
     lattice: Lattice = struct.field(pytree_node=False)
     """The points on which the covered area is counted."""
 

@@ -71,11 +71,10 @@ def make_env(
     positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
     height_m, width_m = (side * occupancy_map.resolution for side in occupancy_map.occupied.shape)
-    sight = _ray_grid(
-        occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
-    )
     return EnvParams(
-        sight=sight,
+        sight=_ray_grid(
+            occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
+        ),
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
@@ -100,7 +99,6 @@ def make_env(
         ),
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
-        ray_iterations=config.ray_iterations,
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
     )
 
