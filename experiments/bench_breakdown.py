@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.bench_simulator import draw_chance
+from experiments.bench_simulator import draw_actions
 from experiments.timing import Program, four_digits, time_in_turns
 from sqn_jax import train
 from sqn_jax.agent import pqn
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
 from sqn_jax.env.dynamics import move
-from sqn_jax.rollout import start_fleet, unroll
+from sqn_jax.rollout import draw_chance, start_fleet, unroll
 from sqn_jax.scores import markdown_table
 
 Piece = Callable[[EnvState, Array, EnvParams], tuple[EnvState, Any]]
@@ -75,7 +75,7 @@ def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int
     _, states = jax.jit(jax.vmap(navigation.reset, in_axes=(0, None)))(
         jax.random.split(start_key, num_envs), params
     )
-    actions, _ = draw_chance(action_key, step_key, num_steps, num_envs)
+    actions, _ = draw_actions(action_key, step_key, num_steps, num_envs)
 
     @jax.jit
     def drive(states: EnvState, actions: Array, params: EnvParams) -> Any:
@@ -90,15 +90,15 @@ def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program
     network = train.network_of(config)
     runner = train.start_run(params, config)
     key = jax.random.key(1)
-    fleet = jax.jit(lambda key, params: start_fleet(key, config.num_envs, network, params))(
-        key, params
-    )
+    keys = jax.random.split(key, config.num_envs)
+    fleet = jax.jit(lambda keys, params: start_fleet(keys, network, params))(keys, params)
     num_steps = params.max_steps // train.num_windows(config, params)
     epsilon = jnp.zeros(config.num_envs)
 
     @jax.jit
     def drive(learner: Any, fleet: Any, params: EnvParams) -> Any:
-        return unroll(key, network, learner.params, fleet, epsilon, params, num_steps=num_steps)[1]
+        chance = draw_chance(key, num_steps, config.num_envs)
+        return unroll(chance, network, learner.params, fleet, epsilon, params)[1]
 
     optimizer = train.optimizer_of(config, params)
 

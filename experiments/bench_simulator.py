@@ -32,10 +32,11 @@ def drive_ours(key: Array, params: EnvParams, num_envs: int, num_steps: int) -> 
         )
         return states, (obs, reward, info["reached"])
 
-    return jax.lax.scan(body, states, draw_chance(action_key, step_key, num_steps, num_envs))[1]
+    chance = draw_actions(action_key, step_key, num_steps, num_envs)
+    return jax.lax.scan(body, states, chance)[1]
 
 
-def draw_chance(
+def draw_actions(
     action_key: Array, step_key: Array, num_steps: int, num_envs: int
 ) -> tuple[Array, Array]:
     """Random actions and keys for the steps, [T, N] each; drawn alike for both simulators."""
@@ -68,7 +69,9 @@ def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
             obs, states, reward, *_ = jax.vmap(advance)(keys, states, {"agent_0": actions})
             return states, (obs["agent_0"], reward["agent_0"])
 
-        return jax.lax.scan(body, states, draw_chance(action_key, step_key, num_steps, num_envs))[1]
+        return jax.lax.scan(body, states, draw_actions(action_key, step_key, num_steps, num_envs))[
+            1
+        ]
 
     return lambda turn: drive(jax.random.key(turn))
 

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 from experiments.timing import Timing, four_digits
-from sqn_jax import train
+from sqn_jax import devices, train
 from sqn_jax.agent import r2d2, replay
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams
@@ -29,8 +29,10 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
         Steps and updates a second (of all seeds), slowest and fastest steps a second, seconds to
         compile and of the first call.
     """
-    runner = train.start_run(env_params, config)
-    program, compile_seconds = train.compile_chunk(runner, env_params, config)
+    mesh = devices.choose(config)
+    runner = train.start_run(env_params, config, mesh)
+    program, compile_seconds = train.compile_chunk(env_params, config, mesh)
+    env_params = devices.place(env_params, mesh)
     warm_up = 0.0
     seconds: list[float] = []
     updates = 0
@@ -52,6 +54,7 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
         "method": config.method,
         "map": config.map,
         "num_envs": config.num_envs,
+        "num_devices": 1 if mesh is None else mesh.size,
         "steps_per_chunk": steps,
         **timing.rates(steps, unit="steps_per_second"),
         "updates_per_second": four_digits(updates_a_chunk / timing.median),

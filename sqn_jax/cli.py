@@ -94,6 +94,7 @@ def _train(words: list[str]) -> int:
     parser.add_argument("--preset", choices=list(PRESETS))
     parser.add_argument("--run-dir", "--run_dir", type=_folder)
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--num-devices", "--num_devices", type=int)
     own, others = parser.parse_known_args(words)
     if own.resume:
         if own.run_dir is None:
@@ -101,16 +102,16 @@ def _train(words: list[str]) -> int:
         if others or own.preset:
             raise ValueError(
                 "--resume takes every setting from the run folder, expected no option but "
-                f"--run-dir, got {' '.join(others) or '--preset'}"
+                f"--run-dir and --num-devices, got {' '.join(others) or '--preset'}"
             )
         from sqn_jax.runlog import RunFolder
 
         _, config = RunFolder.open(own.run_dir)
-        return _run_training(config, own.run_dir, resume=True)
+        return _run_training(config, own.run_dir, resume=True, num_devices=own.num_devices)
     preset = own.preset or "quick"
     config = _parse_config(others, preset)
     run_dir = own.run_dir or _default_run_dir(config, preset)
-    return _run_training(config, run_dir, resume=False)
+    return _run_training(config, run_dir, resume=False, num_devices=own.num_devices)
 
 
 def _folder(word: str) -> Path:
@@ -126,7 +127,9 @@ def _parse_config(words: list[str], preset: str) -> TrainConfig:
     description = (
         "Train an agent, evaluate it, and draw what it did. Besides the options below: "
         f"--preset {{{','.join(PRESETS)}}} (default quick) chooses the defaults shown here, "
-        "--run-dir DIR where to write (default runs/NAME), --resume goes on with --run-dir. "
+        "--run-dir DIR where to write (default runs/NAME), --resume goes on with --run-dir, "
+        "--num-devices N divides the robots between N cores of the CPU or N accelerators (default "
+        "as many cores as help, or one accelerator). "
         f"{CACHE}"
     )
     told = io.StringIO()
@@ -165,12 +168,14 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
     return Path("runs") / f"{stamp}_{config.algo}_{Path(config.map).stem}_{preset}"
 
 
-def _run_training(config: TrainConfig, run_dir: Path, *, resume: bool) -> int:
+def _run_training(
+    config: TrainConfig, run_dir: Path, *, resume: bool, num_devices: int | None
+) -> int:
     from sqn_jax.session import Stopped, train_session
 
     config = _with_absolute_map(config)
     try:
-        train_session(config, run_dir, resume=resume)
+        train_session(config, run_dir, resume=resume, num_devices=num_devices)
     except Stopped as stop:
         print(f"saved; go on with `sqn train --run-dir {run_dir} --resume`", file=sys.stderr)
         return stop.exit_code

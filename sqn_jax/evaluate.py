@@ -23,6 +23,7 @@ from sqn_jax.rollout import (
     EpisodeSummary,
     Fleet,
     Trace,
+    draw_chance,
     noise_keys,
     start_fleet,
     summarize,
@@ -45,7 +46,7 @@ def start_episode(key: Array, network: QNetwork, env_params: EnvParams) -> tuple
         The key to drive it with, and the robot.
     """
     start_key, drive_key = jax.random.split(key)
-    return drive_key, start_fleet(start_key, 1, network, env_params)
+    return drive_key, start_fleet(jax.random.split(start_key, 1), network, env_params)
 
 
 def run_episodes(
@@ -115,8 +116,8 @@ def _drive(
     def one(key: Array) -> tuple[EpisodeSummary, Trace]:
         drive_key, fleet = start_episode(key, network, env_params)
         greedy = jnp.zeros(1)
-        steps = env_params.max_steps
-        trace = unroll(drive_key, network, params, fleet, greedy, env_params, num_steps=steps)[2]
+        chance = draw_chance(drive_key, env_params.max_steps, 1)
+        trace = unroll(chance, network, params, fleet, greedy, env_params)[2]
         summaries = jax.vmap(partial(summarize, trace))(goal_radii)
         return _episodes((summaries, trace), 0)
 

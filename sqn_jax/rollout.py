@@ -52,24 +52,23 @@ class Fleet:
     """[N, H] recurrent state of their network."""
 
 
-def start_fleet(key: Array, num_envs: int, network: QNetwork, env_params: EnvParams) -> Fleet:
-    """Start N independent episodes; the key is consumed."""
-    keys = jax.random.split(key, num_envs)
+def start_fleet(keys: Array, network: QNetwork, env_params: EnvParams) -> Fleet:
+    """Start an episode for each of the keys [N], which are consumed."""
     obs, state = jax.vmap(navigation.reset, in_axes=(0, None))(keys, env_params)
-    return Fleet(obs=obs, state=state, carry=initial_carry(network.config, num_envs))
+    return Fleet(obs=obs, state=state, carry=initial_carry(network.config, keys.shape[0]))
 
 
 def restart_at_goal(
-    key: Array, fleet: Fleet, network: QNetwork, env_params: EnvParams
+    keys: Array, fleet: Fleet, network: QNetwork, env_params: EnvParams
 ) -> tuple[Fleet, Array]:
-    """Give every robot that stands within the goal radius a new task; the key is consumed.
+    """Give every robot that stands within the goal radius a new task; the keys [N] are consumed.
 
     Returns:
         The fleet, and which robots [N] have begun anew.
     """
     away = fleet.state.goal - fleet.state.pose[:, :2]
     arrived = jnp.hypot(away[:, 0], away[:, 1]) < env_params.goal_radius
-    fresh = start_fleet(key, arrived.shape[0], network, env_params)
+    fresh = start_fleet(keys, network, env_params)
 
     def choose(new: Array, old: Array) -> Array:
         return jnp.where(jnp.expand_dims(arrived, tuple(range(1, old.ndim))), new, old)
@@ -77,26 +76,41 @@ def restart_at_goal(
     return jax.tree.map(choose, fresh, fleet), arrived
 
 
+Chance = tuple[Array, Array, Array]
+"""All that is left to chance while N robots drive T steps, [T, N] each: coins and actions for
+exploration, and keys for the simulator's noise."""
+
+
+def draw_chance(key: Array, num_steps: int, num_envs: int) -> Chance:
+    """Draw it for a whole unroll at once; the key is consumed."""
+    explore_key, noise_key = jax.random.split(key)
+    shape = (num_steps, num_envs)
+    coins, random_actions = draw_exploration(explore_key, shape, navigation.NUM_ACTIONS)
+    return coins, random_actions, noise_keys(noise_key, *shape)
+
+
+def noise_keys(key: Array, num_steps: int, num_envs: int) -> Array:
+    """The keys [T, N] that an unroll hands to the simulator; the key is consumed."""
+    return jax.random.split(key, (num_steps, num_envs))
+
+
 def unroll(
-    key: Array,
+    chance: Chance,
     network: QNetwork,
     params: Params,
     fleet: Fleet,
     epsilon: Array,
     env_params: EnvParams,
-    *,
-    num_steps: int,
 ) -> tuple[Fleet, Episodes, Trace]:
     """Drive N robots for T steps, without reset.
 
     Args:
-        key: consumed.
+        chance: from `draw_chance`, consumed; lays down T and N.
         network: the agent.
         params: its parameters.
         fleet: the robots.
         epsilon: [N] probabilities of a random action; 0 is greedy.
         env_params: the world.
-        num_steps: T.
 
     Returns:
         The robots afterwards, the steps for the learner, and the trace for statistics and
@@ -105,10 +119,6 @@ def unroll(
     act_and_step = partial(
         _act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
     )
-    explore_key, noise_key = jax.random.split(key)
-    shape = (num_steps, epsilon.shape[0])
-    draws = draw_exploration(explore_key, shape, navigation.NUM_ACTIONS)
-    chance = (*draws, noise_keys(noise_key, *shape))
     last, (observations, poses, actions, results, outputs) = jax.lax.scan(
         act_and_step, fleet, chance
     )
@@ -133,14 +143,9 @@ def unroll(
     return last, episodes, trace
 
 
-def noise_keys(key: Array, num_steps: int, num_envs: int) -> Array:
-    """The keys [T, N] that an unroll hands to the simulator; the key is consumed."""
-    return jax.random.split(key, (num_steps, num_envs))
-
-
 def _act_and_step(
     fleet: Fleet,
-    chance: tuple[Array, Array, Array],
+    chance: Chance,
     *,
     network: QNetwork,
     params: Params,

@@ -16,9 +16,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from tqdm import tqdm
 
 import sqn_jax
+from sqn_jax import devices
 from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.compare import (
     Agent,
@@ -45,6 +47,7 @@ from sqn_jax.train import (
     num_windows,
     policy_params,
     run,
+    runner_shapes,
     start_run,
 )
 
@@ -58,34 +61,44 @@ class Stopped(Exception):
 
 
 @kept_programs()
-def train_session(config: TrainConfig, run_dir: Path, *, resume: bool = False) -> None:
+def train_session(
+    config: TrainConfig, run_dir: Path, *, resume: bool = False, num_devices: int | None = None
+) -> None:
     """Train, evaluate and draw, telling the terminal about it.
 
     Args:
         config: the settings; of a resumed run those in its folder.
         run_dir: where everything goes.
         resume: go on from the newest checkpoint in `run_dir`.
+        num_devices: see `devices.choose`.
 
     Raises:
-        ValueError: the map or the folder is unusable.
+        ValueError: the map, the folder or the number of devices is unusable.
         Stopped: by SIGINT or SIGTERM, after the chunk was finished and saved.
     """
+    devices.use_cores()
+    mesh = devices.choose(config, num_devices)
     occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
     num_windows(config, env_params)
     folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
-    _announce(config, env_params, run_dir)
+    _announce(config, env_params, run_dir, mesh)
     with Checkpoints(run_dir) as checkpoints:
-        runner, seconds_before = _first_state(config, env_params, folder, checkpoints, resume)
-        runner, timing = _train(runner, env_params, config, folder, checkpoints, seconds_before)
+        if resume:
+            shapes = runner_shapes(env_params, config, mesh)
+            runner, seconds_before = _restored(shapes, config, folder, checkpoints)
+        else:
+            runner, seconds_before = start_run(env_params, config, mesh), 0.0
+        runner, timing = _train(
+            runner, env_params, config, folder, checkpoints, seconds_before, mesh
+        )
     results, drawn = _evaluate(runner, occupancy_map, config, folder)
     figures = _draw(drawn, occupancy_map, config, folder)
     _conclude(results, timing, figures, config, folder)
 
 
-def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path) -> None:
-    device = jax.devices()[0]
+def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None) -> None:
     seeds = f"seed {config.seed}"
     if config.num_seeds > 1:
         seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
@@ -93,22 +106,22 @@ def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path) -> None
     print(
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
         f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
-        f"run folder {run_dir}, device {device.platform} ({device.device_kind}), "
+        f"run folder {run_dir}, {_device_words(mesh)}, "
         f"episodes in memory {memory_bytes(config, env_params) / 1e6:,.1f} MB"
     )
 
 
-def _first_state(
-    config: TrainConfig,
-    env_params: EnvParams,
-    folder: RunFolder,
-    checkpoints: Checkpoints,
-    resume: bool,
+def _device_words(mesh: Mesh | None) -> str:
+    device = jax.devices()[0]
+    times = "" if mesh is None else f" x {mesh.size}"
+    return f"device {device.platform} ({device.device_kind}){times}"
+
+
+def _restored(
+    shapes: RunnerState, config: TrainConfig, folder: RunFolder, checkpoints: Checkpoints
 ) -> tuple[RunnerState, float]:
     """The state to go on from, and the seconds of training already behind it."""
-    if not resume:
-        return start_run(env_params, config), 0.0
-    runner = checkpoints.restore(jax.eval_shape(start_run, env_params, config=config))
+    runner = checkpoints.restore(shapes)
     chunks = int(np.max(np.asarray(runner.round))) // config.rounds_per_chunk
     folder.keep_metrics(chunks)
     rows = folder.read_metrics()
@@ -123,13 +136,15 @@ def _train(
     folder: RunFolder,
     checkpoints: Checkpoints,
     seconds_before: float,
+    mesh: Mesh | None,
 ) -> tuple[RunnerState, dict[str, float]]:
     """Drive the training to its end; returns the final state and how long it took."""
     timing: dict[str, float] = {"train_seconds": seconds_before, "env_steps": 0.0}
+    timing["num_devices"] = 1 if mesh is None else mesh.size
     episodes_a_chunk = config.rounds_per_chunk * config.num_envs
     print("compiling ...", end="", flush=True)
     with watched_compilation() as was_read:
-        program, timing["compile_seconds"] = compile_chunk(runner, env_params, config)
+        program, timing["compile_seconds"] = compile_chunk(env_params, config, mesh)
     timing["compiled_earlier"] = was_read()
     how = "compiled earlier, read" if was_read() else "compiled"
     print(f"\r{how} in {timing['compile_seconds']:.1f} s")
@@ -137,7 +152,7 @@ def _train(
     rounds_done = int(np.max(np.asarray(runner.round)))
     total = config.num_rounds * config.num_envs
     with _signals() as received, _bar(total, rounds_done * config.num_envs) as bar:
-        for runner, report in run(runner, env_params, config, program):  # noqa: B020
+        for runner, report in run(runner, env_params, config, program, mesh):  # noqa: B020
             timing["train_seconds"] += report.seconds
             timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
             row = _row(report, timing["train_seconds"], env_params, config)
@@ -243,9 +258,9 @@ def _evaluate(
     runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> tuple[list[dict[str, Any]], Drawn]:
     """Greedy episodes of every seed from the evaluation points and from random pairs."""
-    policy = Policy(
-        folder.path.name, config, seeds_of(policy_params(runner.learner, config), config)
-    )
+    # On one device: every program that is given them would else run on each of the mesh.
+    params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
+    policy = Policy(folder.path.name, config, seeds_of(params, config))
     settings = Settings(
         maps=(config.map,),
         tasks=("evaluation points", "random pairs"),
@@ -321,6 +336,7 @@ def _conclude(
         "compiled_earlier": bool(timing["compiled_earlier"]),
         "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
         "device": f"{device.platform} ({device.device_kind})",
+        "num_devices": timing["num_devices"],
         "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
     }
     print(

@@ -2,6 +2,10 @@
 
 `train_chunk` is the device program; `run` drives it chunk by chunk and hands numbers to the host
 in between. Files, bars and pictures stand outside, in whoever consumes the generator.
+
+With a mesh of several devices (`devices.choose`) each of them drives and learns from its share of
+the robots. Chance is drawn for all robots alike on each, so that no robot's fate depends on the
+number of devices.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 import optax
 from flax import struct
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from sqn_jax.agent import pqn, r2d2, replay
 from sqn_jax.agent.experience import Episodes
@@ -26,11 +31,14 @@ from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, discount_schedule, init_learner, make_optimizer
 from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.agent.replay import ReplayState
+from sqn_jax.agent.shares import mean, own_share
 from sqn_jax.config import TrainConfig
+from sqn_jax.devices import AXIS, place, placed_shapes
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.rollout import (
     Fleet,
     Trace,
+    draw_chance,
     join_windows,
     restart_at_goal,
     start_fleet,
@@ -103,16 +111,17 @@ def episode_shapes(config: TrainConfig, env_params: EnvParams) -> Episodes:
     num_steps = env_params.max_steps // num_windows(config, env_params)
 
     def one_unroll(key: Array) -> Episodes:
-        fleet = start_fleet(key, config.num_envs, network, env_params)
+        fleet = start_fleet(jax.random.split(key, config.num_envs), network, env_params)
         params = network.init(key, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
         epsilon = jnp.zeros(config.num_envs)
-        return unroll(key, network, params, fleet, epsilon, env_params, num_steps=num_steps)[1]
+        chance = draw_chance(key, num_steps, config.num_envs)
+        return unroll(chance, network, params, fleet, epsilon, env_params)[1]
 
     return jax.eval_shape(one_unroll, jax.random.key(0))
 
 
 def memory_bytes(config: TrainConfig, env_params: EnvParams) -> int:
-    """Bytes that the replay of all seeds and the episodes of a round will take."""
+    """Bytes that the replay of all seeds and the episodes of a round will take, on all devices."""
     episodes = episode_shapes(config, env_params)
     total = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(episodes))
     if config.method == "r2d2":
@@ -124,7 +133,7 @@ def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> Runne
     """The state of one run before its first round; the key is consumed."""
     learner_key, obs_key, run_key = jax.random.split(key, 3)
     network = network_of(config)
-    fleet = start_fleet(obs_key, 1, network, env_params)
+    fleet = start_fleet(jax.random.split(obs_key, 1), network, env_params)
     learner = init_learner(
         learner_key,
         network,
@@ -135,19 +144,30 @@ def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> Runne
     memory: ReplayState | None = None
     if config.method == "r2d2":
         item = r2d2.packed_item(episode_shapes(config, env_params))
-        memory = replay.init(item, config.replay.capacity)
+        memory = replay.init(item, config.replay.capacity, config.num_envs)
     return RunnerState(learner=learner, memory=memory, key=run_key, round=jnp.int32(0))
 
 
 def train_round(
-    runner: RunnerState, _: None, *, env_params: EnvParams, config: TrainConfig
+    runner: RunnerState,
+    _: None,
+    *,
+    env_params: EnvParams,
+    config: TrainConfig,
+    axis_name: str | None = None,
 ) -> tuple[RunnerState, dict[str, Array]]:
-    """One whole episode of all robots, with the updates; returns scalars to log."""
+    """One whole episode of all robots, with the updates; returns scalars to log.
+
+    With the name of an axis of devices, of this device's share of the robots; the scalars are those
+    of all.
+    """
     key, fleet_key, window_key = jax.random.split(runner.key, 3)
     windows = num_windows(config, env_params)
     progress = runner.round / config.num_rounds
     epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
-    fleet = start_fleet(fleet_key, config.num_envs, network_of(config), env_params)
+    epsilon = own_share(epsilon, axis_name)
+    fleet_keys = own_share(jax.random.split(fleet_key, config.num_envs), axis_name)
+    fleet = start_fleet(fleet_keys, network_of(config), env_params)
     discount = discount_schedule(progress, config.learner)
     body = partial(
         _drive_and_learn,
@@ -155,21 +175,24 @@ def train_round(
         discount=discount,
         env_params=env_params,
         config=config,
+        axis_name=axis_name,
     )
-    on_first_task = jnp.ones(config.num_envs, bool)
+    on_first_task = jnp.ones(epsilon.shape[0], bool)
     first = (runner.learner, runner.memory, fleet, on_first_task)
     keys = jax.random.split(window_key, windows)
     (learner, memory, _fleet, _first), (traces, learning) = jax.lax.scan(body, first, keys)
     trace = join_windows(traces)
     summary = summarize(trace, env_params.goal_radius)
-    metrics = {
+    told = {
         "mean_reward": summary.mean_reward.mean(),
         "success": summary.success.mean(),
         "time_steps": summary.time_steps.mean(),
         "collisions": summary.collisions.mean(),
         "covered_area": summary.covered_area.mean(),
-        "updates": learner.num_updates,
         "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
+    }
+    metrics = mean(told, axis_name) | {
+        "updates": learner.num_updates,
         "epsilon": epsilon_schedule(progress, config.exploration),
         "discount": jnp.asarray(discount, jnp.float32),
         **jax.tree.map(jnp.mean, learning),
@@ -186,6 +209,7 @@ def _drive_and_learn(
     discount: Array | float,
     env_params: EnvParams,
     config: TrainConfig,
+    axis_name: str | None,
 ) -> tuple[tuple[LearnerState, Any, Fleet, Array], tuple[Trace, dict[str, Array]]]:
     """One window: drive it, learn from it, and send robots that have arrived to new goals.
 
@@ -196,24 +220,24 @@ def _drive_and_learn(
     unroll_key, learn_key, restart_key = jax.random.split(key, 3)
     network = network_of(config)
     num_steps = env_params.max_steps // num_windows(config, env_params)
-    fleet, episodes, trace = unroll(
-        unroll_key, network, learner.params, fleet, epsilon, env_params, num_steps=num_steps
-    )
+    chance = own_share(draw_chance(unroll_key, num_steps, config.num_envs), axis_name, axis=1)
+    fleet, episodes, trace = unroll(chance, network, learner.params, fleet, epsilon, env_params)
     learn = r2d2.learn if config.method == "r2d2" else pqn.learn
     optimizer = optimizer_of(config, env_params)
     learner, memory, metrics = learn(
-        learn_key, learner, memory, episodes, network, optimizer, config, discount
+        learn_key, learner, memory, episodes, network, optimizer, config, discount, axis_name
     )
     distances = jnp.where(on_first_task[None], trace.goal_distances, jnp.inf)
     trace = dataclasses.replace(trace, goal_distances=distances)
     if config.method == "pqn" and config.learner.restart_at_goal:
-        fleet, restarted = restart_at_goal(restart_key, fleet, network, env_params)
+        restart_keys = own_share(jax.random.split(restart_key, config.num_envs), axis_name)
+        fleet, restarted = restart_at_goal(restart_keys, fleet, network, env_params)
         on_first_task &= ~restarted
     return (learner, memory, fleet, on_first_task), (trace, metrics)
 
 
 def train_chunk(
-    runner: RunnerState, env_params: EnvParams, config: TrainConfig
+    runner: RunnerState, env_params: EnvParams, config: TrainConfig, mesh: Mesh | None = None
 ) -> tuple[RunnerState, dict[str, Array]]:
     """Scan over `rounds_per_chunk` rounds; nothing returns to the host in between.
 
@@ -221,31 +245,74 @@ def train_chunk(
         runner: donated; with `num_seeds` > 1 every array has a leading axis [K].
         env_params: the world, shared by all seeds.
         config: static.
+        mesh: static, devices to divide the robots between; None for one alone.
 
     Returns:
         The new state and metrics [rounds] ([K, rounds] for several seeds).
     """
+    if mesh is None:
+        return _share_of_chunk(runner, env_params, config=config, axis_name=None)
+    held = runner_specs(config)
+    return jax.shard_map(
+        partial(_share_of_chunk, config=config, axis_name=AXIS),
+        mesh=mesh,
+        in_specs=(held, PartitionSpec()),
+        out_specs=(held, PartitionSpec()),
+        check_vma=False,  # Loops in the simulator begin with constants, which vary nowhere.
+    )(runner, env_params)
+
+
+def _share_of_chunk(
+    runner: RunnerState, env_params: EnvParams, *, config: TrainConfig, axis_name: str | None
+) -> tuple[RunnerState, dict[str, Array]]:
+    """What one device does."""
+    body = partial(train_round, env_params=env_params, config=config, axis_name=axis_name)
 
     def scan(one: RunnerState) -> tuple[RunnerState, dict[str, Array]]:
-        body = partial(train_round, env_params=env_params, config=config)
         return jax.lax.scan(body, one, None, length=config.rounds_per_chunk)
 
     return scan(runner) if config.num_seeds == 1 else jax.vmap(scan)(runner)
 
 
-compiled_train_chunk = jax.jit(train_chunk, static_argnames="config", donate_argnames="runner")
+def runner_specs(config: TrainConfig) -> RunnerState:
+    """How the arrays of a state are divided between devices: only what the replay stores is."""
+    whole: Any = PartitionSpec()
+    memory: Any = None
+    if config.method == "r2d2":
+        seeds = () if config.num_seeds == 1 else (None,)
+        stored: Any = PartitionSpec(*seeds, None, AXIS)
+        memory = ReplayState(stored, whole, whole, whole, whole)
+    return RunnerState(learner=whole, memory=memory, key=whole, round=whole)
+
+
+compiled_train_chunk = jax.jit(
+    train_chunk, static_argnames=("config", "mesh"), donate_argnames="runner"
+)
+
+
+def start_run(env_params: EnvParams, config: TrainConfig, mesh: Mesh | None = None) -> RunnerState:
+    """State of a new run: seed `config.seed`, or several with consecutive seeds side by side.
+
+    Run i of several has the same key as a single run with seed `config.seed + i`. With a mesh, the
+    arrays lie on its devices.
+    """
+    return place(_start_run(env_params, config), mesh, runner_specs(config))
 
 
 @partial(jax.jit, static_argnames="config")
-def start_run(env_params: EnvParams, config: TrainConfig) -> RunnerState:
-    """State of a new run: seed `config.seed`, or several with consecutive seeds side by side.
-
-    Run i of several has the same key as a single run with seed `config.seed + i`.
-    """
+def _start_run(env_params: EnvParams, config: TrainConfig) -> RunnerState:
     if config.num_seeds == 1:
         return init_runner(jax.random.key(config.seed), env_params, config)
     keys = jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
     return jax.vmap(lambda key: init_runner(key, env_params, config))(keys)
+
+
+def runner_shapes(
+    env_params: EnvParams, config: TrainConfig, mesh: Mesh | None = None
+) -> RunnerState:
+    """Shapes, dtypes and places of what `start_run` makes, without computing anything."""
+    shapes = jax.eval_shape(partial(_start_run, config=config), env_params)
+    return placed_shapes(shapes, mesh, runner_specs(config))
 
 
 @dataclass(frozen=True)
@@ -265,16 +332,17 @@ ChunkProgram = Callable[[RunnerState, EnvParams], tuple[RunnerState, dict[str, A
 
 
 def compile_chunk(
-    runner: RunnerState, env_params: EnvParams, config: TrainConfig
+    env_params: EnvParams, config: TrainConfig, mesh: Mesh | None = None
 ) -> tuple[ChunkProgram, float]:
-    """Compile `train_chunk` for states like `runner`; returns it and the seconds it took.
+    """Compile `train_chunk`; returns it and the seconds it took.
 
     It is compiled from shapes: arrays from a checkpoint are bound to their device, and a program
     made for those is not the one that a new run has compiled and kept.
     """
     started = time.perf_counter()
-    shapes = jax.eval_shape(lambda *given: given, runner, env_params)
-    program = compiled_train_chunk.lower(*shapes, config).compile()
+    world = placed_shapes(jax.eval_shape(lambda x: x, env_params), mesh)
+    runner = runner_shapes(env_params, config, mesh)
+    program = compiled_train_chunk.lower(runner, world, config, mesh).compile()
     return program, time.perf_counter() - started
 
 
@@ -283,14 +351,17 @@ def run(
     env_params: EnvParams,
     config: TrainConfig,
     program: ChunkProgram | None = None,
+    mesh: Mesh | None = None,
 ) -> Iterator[tuple[RunnerState, ChunkReport]]:
     """Train chunk by chunk from any state to the end, yielding after each.
 
     The yielded state is donated to the next chunk: use it before asking for the next one.
-    `program` comes from `compile_chunk`; without one the first chunk waits for it.
+    `program` comes from `compile_chunk`; without one the first chunk waits for it. With a mesh,
+    `runner` lies on its devices.
     """
+    env_params = place(env_params, mesh)
     if program is None:
-        program, _ = compile_chunk(runner, env_params, config)
+        program, _ = compile_chunk(env_params, config, mesh)
     rounds_done = int(np.max(np.asarray(runner.round)))
     for chunk in range(rounds_done // config.rounds_per_chunk + 1, config.num_chunks + 1):
         started = time.perf_counter()

@@ -49,7 +49,7 @@ def random_params(network: QNetwork, env_params: EnvParams, seed: int = 0) -> An
     """Weights large enough that greedy robots do different things."""
 
     def initial(key: jax.Array) -> Any:
-        obs = jax.tree.map(lambda x: x[None], start_fleet(key, 1, network, env_params).obs)
+        obs = jax.tree.map(lambda x: x[None], start_fleet(key[None], network, env_params).obs)
         return network.init(key, obs, initial_carry(network.config, 1))
 
     shapes = jax.eval_shape(initial, jax.random.key(0))

@@ -166,7 +166,7 @@ def test_an_update_from_drawn_episodes_is_that_of_the_learner() -> None:
         "optimizer": optimizer,
         "config": config,
     }
-    memory = replay.add(replay.init(r2d2.packed_item(first), 1), r2d2.pack(first))
+    memory = replay.add(replay.init(r2d2.packed_item(first), 1, 1), r2d2.pack(first))
     twice = jax.tree.map(lambda x: jnp.repeat(x, 2, axis=0), memory.storage)
     batch = (r2d2.unpack(twice, SIZES.hidden_size), jnp.ones(2))
     with compiling_quickly():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from sqn_jax.env import EnvParams, step, true_ranges
 from sqn_jax.rollout import (
     Fleet,
     Trace,
+    draw_chance,
     join_windows,
     restart_at_goal,
     start_fleet,
@@ -31,8 +33,29 @@ from sqn_jax.rollout import (
 LENGTH, ROBOTS, ACTIONS = 14, 3, 5
 NETWORK = make_network("sqn", NetworkConfig(hidden_size=8), ACTIONS)
 
-drive = jax.jit(unroll, static_argnames=("network", "num_steps"))
-start = jax.jit(start_fleet, static_argnames=("num_envs", "network"))
+
+@partial(jax.jit, static_argnames=("network", "num_steps"))
+def drive(
+    key: Array,
+    network: Any,
+    params: Any,
+    fleet: Fleet,
+    epsilon: Array,
+    env_params: EnvParams,
+    *,
+    num_steps: int,
+) -> Any:
+    """An unroll with all its chance from one key."""
+    chance = draw_chance(key, num_steps, epsilon.shape[0])
+    return unroll(chance, network, params, fleet, epsilon, env_params)
+
+
+@partial(jax.jit, static_argnames=("num_envs", "network"))
+def start(key: Array, num_envs: int, network: Any, env_params: EnvParams) -> Fleet:
+    """A fleet from one key."""
+    return start_fleet(jax.random.split(key, num_envs), network, env_params)
+
+
 step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, None)))
 
 
@@ -275,7 +298,7 @@ def test_robots_at_their_goal_begin_anew_and_the_others_go_on(room: EnvParams) -
     carry = jnp.asarray(rng.normal(size=fleet.carry.shape), jnp.float32)
     driven = dataclasses.replace(fleet, state=state, carry=carry)
     after, restarted = jax.jit(restart_at_goal, static_argnames="network")(
-        jax.random.key(23), driven, NETWORK, room
+        jax.random.split(jax.random.key(23), 40), driven, NETWORK, room
     )
     expected = np.abs(away) < 0.3
     assert 5 < expected.sum() < 35

@@ -169,12 +169,11 @@ def test_the_program_is_traced_once(either: Trained) -> None:
 def test_a_state_from_a_checkpoint_gets_the_program_of_a_new_one(smoke: Trained) -> None:
     """Arrays from a checkpoint are bound to their device: JAX would make another program for them,
     and the one that the first start has compiled and kept would be of no use to the second."""
-    bound = jax.device_put(smoke.final, jax.devices()[0])
+    bound = jax.device_put(smoke.world, jax.devices()[0])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jax.stages.Lowered, "compile", jax.stages.Lowered.as_text)
         new, resumed = (
-            train.compile_chunk(state, smoke.world, smoke.config)[0]
-            for state in (smoke.final, bound)
+            train.compile_chunk(world, smoke.config)[0] for world in (smoke.world, bound)
         )
     assert "while" in str(new)
     assert new == resumed

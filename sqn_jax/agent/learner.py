@@ -14,6 +14,7 @@ from jax import Array
 
 from sqn_jax.agent.loss import LossOutput
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
+from sqn_jax.agent.shares import mean
 from sqn_jax.config import LearnerConfig
 
 
@@ -79,13 +80,23 @@ def gradient_step(
     state: LearnerState,
     optimizer: optax.GradientTransformation,
     loss_function: Callable[[Params], tuple[Array, LossOutput]],
+    axis_name: str | None = None,
 ) -> tuple[LearnerState, LossOutput, dict[str, Array]]:
     """One step of the optimiser down a loss of the online parameters.
+
+    With the name of an axis of devices, down the mean of their losses: each takes the same step.
 
     Returns:
         The new state, the loss's by-products, and scalars worth logging.
     """
     (loss, output), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params)
+    told = {
+        "loss": loss,
+        "mean_q": output.mean_q,
+        "gate_entropy": output.gate_entropy,
+        "skill_distance": output.skill_distance,
+    }
+    gradient, told = mean((gradient, told), axis_name)
     updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
     new_state = dataclasses.replace(
         state,
@@ -93,14 +104,7 @@ def gradient_step(
         opt_state=opt_state,
         num_updates=state.num_updates + 1,
     )
-    metrics = {
-        "loss": loss,
-        "gradient_norm": optax.tree.norm(gradient),
-        "mean_q": output.mean_q,
-        "gate_entropy": output.gate_entropy,
-        "skill_distance": output.skill_distance,
-    }
-    return new_state, output, metrics
+    return new_state, output, told | {"gradient_norm": optax.tree.norm(gradient)}
 
 
 def average_params(state: LearnerState, share: float) -> LearnerState:

@@ -32,17 +32,24 @@ def learn(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
     discount: Array | float | None = None,
+    axis_name: str | None = None,
 ) -> tuple[LearnerState, None, dict[str, Array]]:
     """Go through a window of all robots in minibatches, each robot equally often.
 
     Robot n is in minibatch n mod M, so that each minibatch spans the exploration ladder. Robots
-    are independent of each other: there is nothing to shuffle, and the key is not needed.
+    are independent of each other: there is nothing to shuffle, and the key is not needed. With the
+    name of an axis of devices, each has its share of the robots and of each minibatch.
     """
     del key
     num_batches = config.num_envs // config.learner.batch_size
     batches = split_robots(episodes, num_batches)
     update = partial(
-        _update, network=network, optimizer=optimizer, config=config, discount=discount
+        _update,
+        network=network,
+        optimizer=optimizer,
+        config=config,
+        discount=discount,
+        axis_name=axis_name,
     )
 
     def one_pass(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, Array]]:
@@ -77,11 +84,12 @@ def _update(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
     discount: Array | float | None,
+    axis_name: str | None,
 ) -> tuple[LearnerState, dict[str, Array]]:
     def loss_function(params: Any) -> Any:
         return pqn_loss(params, network, episodes, config.learner, discount)
 
-    state, _, metrics = gradient_step(state, optimizer, loss_function)
+    state, _, metrics = gradient_step(state, optimizer, loss_function, axis_name)
     if state.target_params is not None:
         state = average_params(state, config.learner.average_share)
     return state, metrics

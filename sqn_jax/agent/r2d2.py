@@ -23,6 +23,7 @@ from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.networks import QNetwork
 from sqn_jax.agent.replay import ReplayState
+from sqn_jax.agent.shares import all_shares
 from sqn_jax.config import TrainConfig
 
 
@@ -86,11 +87,21 @@ def learn(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
     discount: Array | float | None = None,
+    axis_name: str | None = None,
 ) -> tuple[LearnerState, ReplayState, dict[str, Array]]:
-    """Store a round of episodes and update, once enough are stored; the key is consumed."""
+    """Store a round of episodes and update, once enough are stored; the key is consumed.
+
+    With the name of an axis of devices, each stores its share of the round and learns from its
+    share of every minibatch; all are given the same key.
+    """
     memory = replay.add(memory, pack(episodes))
     update = partial(
-        _update, network=network, optimizer=optimizer, config=config, discount=discount
+        _update,
+        network=network,
+        optimizer=optimizer,
+        config=config,
+        discount=discount,
+        axis_name=axis_name,
     )
     keys = jax.random.split(key, config.updates_per_round)
 
@@ -114,6 +125,7 @@ def _update(
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
     discount: Array | float | None,
+    axis_name: str | None,
 ) -> tuple[tuple[LearnerState, ReplayState], dict[str, Array]]:
     state, memory = carry
     settings = config.replay
@@ -123,6 +135,7 @@ def _update(
         config.learner.batch_size,
         priority_exponent=settings.priority_exponent if settings.prioritized else 0.0,
         importance_exponent=settings.importance_exponent if settings.prioritized else 0.0,
+        axis_name=axis_name,
     )
     episodes = unpack(items, config.network.hidden_size)
 
@@ -131,7 +144,8 @@ def _update(
             params, state.target_params, network, episodes, weights, config.learner, discount
         )
 
-    state, output, metrics = gradient_step(state, optimizer, loss_function)
+    state, output, metrics = gradient_step(state, optimizer, loss_function, axis_name)
     state = update_target(state, config.learner.target_update_rate)
     priorities = replay.sequence_priorities(output.td_errors, settings.max_priority_weight)
+    priorities = all_shares(priorities, axis_name)
     return (state, replay.update_priorities(memory, places, priorities)), metrics

@@ -1,7 +1,8 @@
 """A ring of whole episodes on the device, drawn by priority. It knows nothing of what it stores.
 
 Everything is a pure function of `ReplayState`. Episodes come in blocks of a fixed size that
-divides the capacity, so that a block is one contiguous write.
+divides the capacity, so that a block is one contiguous write. Several devices each store a share of
+every block; priorities are held by all.
 """
 
 from __future__ import annotations
@@ -15,15 +16,18 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from sqn_jax.agent.shares import own_share, take
+
 
 @struct.dataclass
 class ReplayState:
     """Stored items and their priorities."""
 
     storage: Any
-    """A pytree of [capacity, ...] arrays."""
+    """A pytree of [blocks, N, ...] arrays; each device holds its share of every block."""
     priorities: Array
-    """[capacity] float32, positive; 0 where nothing is stored."""
+    """[capacity] float32, positive; 0 where nothing is stored. Item n of block b has the place
+    b N + n."""
     position: Array
     """int32: where the next block goes."""
     size: Array
@@ -32,10 +36,19 @@ class ReplayState:
     """The largest priority seen, given to new items."""
 
 
-def init(example: Any, capacity: int) -> ReplayState:
-    """An empty replay for items shaped like `example`, a pytree of arrays or shape structs."""
+def init(example: Any, capacity: int, block: int) -> ReplayState:
+    """An empty replay for items like `example`, a pytree of arrays or shape structs.
+
+    Args:
+        example: one item.
+        capacity: items to keep.
+        block: N, items that will be added at a time; divides the capacity.
+    """
+    if capacity % block:
+        raise ValueError(f"a block of {block} items does not divide the capacity {capacity}")
+    shape = (capacity // block, block)
     return ReplayState(
-        storage=jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), example),
+        storage=jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), example),
         priorities=jnp.zeros(capacity),
         position=jnp.int32(0),
         size=jnp.int32(0),
@@ -50,23 +63,32 @@ def num_bytes(example: Any, capacity: int) -> int:
 
 
 def add(state: ReplayState, items: Any) -> ReplayState:
-    """Store a block of N items [N, ...], over the oldest once full; N divides the capacity."""
-    block = jax.tree.leaves(items)[0].shape[0]
+    """Store a block of N items [N, ...], over the oldest once full.
+
+    On several devices each is given its own share of the block.
+    """
+    chex.assert_trees_all_equal_shapes_and_dtypes(
+        items, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state.storage)
+    )
     capacity = state.priorities.shape[0]
-    if capacity % block:
-        raise ValueError(f"a block of {block} items does not divide the capacity {capacity}")
-    chex.assert_trees_all_equal_dtypes(state.storage, items)
+    block = _block(state)
 
     def write(stored: Array, new: Array) -> Array:
-        return jax.lax.dynamic_update_slice_in_dim(stored, new, state.position, axis=0)
+        return jax.lax.dynamic_update_index_in_dim(stored, new, state.position // block, axis=0)
 
+    fresh = jnp.full(block, state.max_priority)
     return dataclasses.replace(
         state,
         storage=jax.tree.map(write, state.storage, items),
-        priorities=write(state.priorities, jnp.full(block, state.max_priority)),
+        priorities=jax.lax.dynamic_update_slice_in_dim(state.priorities, fresh, state.position, 0),
         position=(state.position + block) % capacity,
         size=jnp.minimum(state.size + block, capacity),
     )
+
+
+def _block(state: ReplayState) -> int:
+    """Items of a block, on all devices together."""
+    return int(state.priorities.shape[0] // jax.tree.leaves(state.storage)[0].shape[0])
 
 
 def probabilities(state: ReplayState, exponent: float) -> Array:
@@ -83,6 +105,7 @@ def sample(
     *,
     priority_exponent: float,
     importance_exponent: float,
+    axis_name: str | None = None,
 ) -> tuple[Any, Array, Array]:
     """Draw items with replacement (Schaul et al. 2016). The replay must not be empty.
 
@@ -92,19 +115,20 @@ def sample(
         batch_size: items to draw.
         priority_exponent: 0 draws uniformly.
         importance_exponent: 0 leaves the bias of prioritised drawing uncorrected.
+        axis_name: of the devices that share the storage; all are given the same key.
 
     Returns:
         Items [B, ...], their places [B] int32, and importance weights [B] in (0, 1], scaled by
-        their largest.
+        their largest. With several devices, all places but only the own share of items and weights.
     """
     chance = probabilities(state, priority_exponent)
     cumulative = jnp.cumsum(chance)
     draws = jax.random.uniform(key, (batch_size,)) * cumulative[-1]
     places = jnp.searchsorted(cumulative, draws, side="right").astype(jnp.int32)
     places = jnp.minimum(places, state.size - 1)
-    items = jax.tree.map(lambda x: x[places], state.storage)
+    items = take(state.storage, *jnp.divmod(places, _block(state)), axis_name)
     weights = (state.size * chance[places]) ** -importance_exponent
-    return items, places, weights / weights.max()
+    return items, places, own_share(weights / weights.max(), axis_name)
 
 
 def update_priorities(state: ReplayState, places: Array, priorities: Array) -> ReplayState:

@@ -186,7 +186,7 @@ def test_pqn_sees_every_episode_equally_often(
         np.testing.assert_array_equal(part.carry, episodes.carry[np.array(robots)])
         seen.append(robots)
 
-    def no_step(state: Any, optimizer: Any, loss_function: Any) -> Any:
+    def no_step(state: Any, optimizer: Any, loss_function: Any, axis_name: Any) -> Any:
         loss_function(state.params)
         return state, None, {"loss": jnp.float32(0)}
 
@@ -207,14 +207,14 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
 
     def fixed_sample(key: Any, memory: Any, batch_size: int, **exponents: float) -> Any:
         asked.append({"batch_size": batch_size, **exponents})
-        items = jax.tree.map(lambda x: x[drawn], memory.storage)
+        items = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[drawn], memory.storage)
         return items, jnp.asarray(drawn), jnp.asarray(weights, jnp.float32)
 
     monkeypatch.setattr(r2d2.replay, "sample", fixed_sample)
     config = config_for("r2d2", updates_per_round=2, learner={"batch_size": 3})
     state = fresh_state(config, 34, use_target=True)
     episodes = random_episodes(np.random.default_rng(35), LENGTH, 6, terminated=0.1)
-    memory = replay.init(r2d2.packed_item(episodes), 12)
+    memory = replay.init(r2d2.packed_item(episodes), 12, 6)
     new_state, new_memory, metrics = learn_with(r2d2, config)(
         jax.random.key(0), state, memory, episodes, discount=jnp.float32(0.6)
     )
@@ -264,7 +264,7 @@ def test_r2d2_only_stores_until_there_are_enough_episodes() -> None:
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=7))
     state = fresh_state(config, 36, use_target=True)
     episodes = random_episodes(np.random.default_rng(37), LENGTH, 6)
-    memory = replay.init(r2d2.packed_item(episodes), 12)
+    memory = replay.init(r2d2.packed_item(episodes), 12, 6)
     learn = learn_with(r2d2, config)
     waiting, memory, metrics = learn(jax.random.key(0), state, memory, episodes)
     assert int(memory.size) == 6
@@ -293,7 +293,7 @@ def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told(
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False))
     state = fresh_state(config, 38, use_target=True)
     episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
-    memory = replay.add(replay.init(r2d2.packed_item(episodes), 12), r2d2.pack(episodes))
+    memory = replay.add(replay.init(r2d2.packed_item(episodes), 12, 6), r2d2.pack(episodes))
     _, after, _ = learn_with(r2d2, config)(jax.random.key(2), state, memory, episodes)
     assert {"priority_exponent": 0.0, "importance_exponent": 0.0} in asked
     assert all(exponents == asked[0] for exponents in asked)

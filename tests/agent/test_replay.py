@@ -29,7 +29,7 @@ def block(first: int, size: int) -> dict[str, jax.Array]:
 
 def filled(priorities: list[float], capacity: int) -> replay.ReplayState:
     """A replay holding one item a priority, item i at place i."""
-    state = replay.init(ITEM, capacity)
+    state = replay.init(ITEM, capacity, 1)
     for place in range(len(priorities)):
         state = add(state, block(place, 1))
     return replay.update_priorities(
@@ -40,7 +40,7 @@ def filled(priorities: list[float], capacity: int) -> replay.ReplayState:
 @pytest.mark.parametrize(("capacity", "size"), [(12, 4), (12, 3), (6, 6), (5, 1)])
 def test_the_ring_holds_what_a_list_of_the_newest_holds(capacity: int, size: int) -> None:
     rng = np.random.default_rng(capacity)
-    state = replay.init(ITEM, capacity)
+    state = replay.init(ITEM, capacity, size)
     places: list[int | None] = [None] * capacity
     priorities = [0.0] * capacity
     largest, following = 1.0, 0
@@ -65,19 +65,25 @@ def test_the_ring_holds_what_a_list_of_the_newest_holds(capacity: int, size: int
         np.testing.assert_allclose(state.priorities, priorities, rtol=1e-6)
         for place in stored:
             expected = block(places[place], 1)
-            np.testing.assert_array_equal(state.storage["a"][place], expected["a"][0])
-            assert int(state.storage["b"][place]) == int(expected["b"][0])
+            row, column = divmod(place, size)
+            np.testing.assert_array_equal(state.storage["a"][row, column], expected["a"][0])
+            assert int(state.storage["b"][row, column]) == int(expected["b"][0])
 
 
 def test_a_block_that_does_not_divide_the_capacity_is_refused() -> None:
     with pytest.raises(ValueError, match="block of 5 items does not divide the capacity 12"):
-        replay.add(replay.init(ITEM, 12), block(0, 5))
+        replay.init(ITEM, 12, 5)
 
 
 def test_items_of_another_type_are_refused() -> None:
     items = block(0, 4)
     with pytest.raises(AssertionError):
-        replay.add(replay.init(ITEM, 12), {**items, "b": items["b"].astype(jnp.float32)})
+        replay.add(replay.init(ITEM, 12, 4), {**items, "b": items["b"].astype(jnp.float32)})
+
+
+def test_a_block_of_another_size_is_refused() -> None:
+    with pytest.raises(AssertionError):
+        replay.add(replay.init(ITEM, 12, 4), block(0, 3))
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 0.9, 1.0])
@@ -140,7 +146,7 @@ def test_weights_are_scaled_by_the_largest_of_the_batch_itself() -> None:
 
 
 def test_a_single_item_in_a_large_replay_is_the_only_one_drawn() -> None:
-    state = replay.init(ITEM, 10_000)
+    state = replay.init(ITEM, 10_000, 1)
     state = add(state, block(7, 1))
     items, places, weights = sample(
         jax.random.key(9), state, 64, priority_exponent=0.9, importance_exponent=0.6
@@ -175,7 +181,7 @@ def test_sequence_priorities_mix_the_largest_and_the_mean_error() -> None:
 
 def test_num_bytes_is_what_is_allocated() -> None:
     item = {"a": jnp.zeros((7, 3), jnp.float32), "b": jnp.zeros(5, jnp.uint8)}
-    allocated = sum(leaf.nbytes for leaf in jax.tree.leaves(replay.init(item, 9)))
+    allocated = sum(leaf.nbytes for leaf in jax.tree.leaves(replay.init(item, 9, 3)))
     assert replay.num_bytes(item, 9) == allocated == 9 * (7 * 3 * 4 + 5 + 4) + 12
 
 
@@ -205,7 +211,7 @@ def test_packed_episodes_come_back_to_the_rounding_of_their_integers() -> None:
 
 def test_episodes_survive_the_replay_in_order() -> None:
     episodes = random_episodes(np.random.default_rng(41), 5, 3)
-    state = replay.init(r2d2.packed_item(episodes), 6)
+    state = replay.init(r2d2.packed_item(episodes), 6, 3)
     state = replay.add(replay.add(state, r2d2.pack(episodes)), r2d2.pack(episodes))
     items, places, _ = sample(
         jax.random.key(10), state, 4, priority_exponent=0.9, importance_exponent=0.6

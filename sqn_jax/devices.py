@@ -1,0 +1,115 @@
+"""One run on several devices: each drives its share of the robots and learns from it.
+
+Robots, minibatches and the replay's episodes are divided evenly; parameters are held by all, and
+gradients averaged. What a robot does and which episodes are drawn does not depend on the number of
+devices: a seed gives the same run, to the rounding of sums.
+
+The cores of a CPU count as devices of their own (`use_cores`). One XLA program on two cores splits
+every small loop between them and waits for both; two programs side by side wait for each other once
+an update.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from sqn_jax.config import TrainConfig
+
+AXIS = "devices"
+"""Name of the axis that shares are taken along, for `jax.lax.pmean` and its kind."""
+
+WHOLE = PartitionSpec()
+"""Each device gets all of an array."""
+
+SMALLEST_SHARE = 8
+"""Robots of a minibatch below which another device is not worth it."""
+
+
+def use_cores() -> None:
+    """Let every core of the CPU be a device; without effect once JAX has started its devices.
+
+    A number that the user has set (`JAX_NUM_CPU_DEVICES`, `XLA_FLAGS`) is left as it is.
+    """
+    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if told or jax.config.jax_num_cpu_devices > 0:  # type: ignore[attr-defined]
+        return
+    try:
+        jax.config.update("jax_num_cpu_devices", num_cores())
+    except RuntimeError:  # The devices are there already.
+        return
+
+
+def num_cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def choose(config: TrainConfig, wanted: int | None = None) -> Mesh | None:
+    """The devices for a run; None stands for one alone.
+
+    Args:
+        config: the run.
+        wanted: how many. By default as many cores of a CPU as leave each at least
+            `SMALLEST_SHARE` robots of a minibatch, and one accelerator.
+
+    Raises:
+        ValueError: there are not as many, or the robots cannot be divided evenly.
+    """
+    available = jax.devices()
+    if wanted is None:
+        most = len(available) if available[0].platform == "cpu" else 1
+        worth = range(1, min(most, config.learner.batch_size // SMALLEST_SHARE) + 1)
+        count = max((n for n in worth if _divides(n, config)), default=1)
+    else:
+        count = wanted
+        _require(1 <= count <= len(available), count, f"1 to {len(available)} of this machine")
+        sizes = f"num_envs ({config.num_envs}) and learner.batch_size ({config.learner.batch_size})"
+        _require(_divides(count, config), count, f"a divisor of {sizes}")
+    if count == 1:
+        return None
+    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=available[:count])
+
+
+def _divides(count: int, config: TrainConfig) -> bool:
+    return config.num_envs % count == 0 and config.learner.batch_size % count == 0
+
+
+def _require(condition: bool, value: int, expected: str) -> None:
+    if not condition:
+        raise ValueError(f"--num-devices is {value}, expected {expected}")
+
+
+def place(tree: Any, mesh: Mesh | None, specs: Any = WHOLE) -> Any:
+    """Arrays on the devices of a mesh.
+
+    Args:
+        tree: arrays.
+        mesh: None leaves them where they are.
+        specs: how they are divided, a tree or the beginning of one.
+    """
+    return tree if mesh is None else jax.device_put(tree, _shardings(mesh, specs))
+
+
+def placed_shapes(shapes: Any, mesh: Mesh | None, specs: Any = WHOLE) -> Any:
+    """Shapes of the arrays that `place` would return for arrays of these shapes."""
+    if mesh is None:
+        return shapes
+    return jax.tree.map(
+        lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+        shapes,
+        jax.tree.broadcast(_shardings(mesh, specs), shapes),
+    )
+
+
+def _shardings(mesh: Mesh, specs: Any) -> Any:
+    return jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec),
+        specs,
+        is_leaf=lambda x: isinstance(x, PartitionSpec),
+    )
