@@ -116,12 +116,10 @@ def unroll(
         The robots afterwards, the steps for the learner, and the trace for statistics and
         pictures.
     """
-    act_and_step = partial(
-        _act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
+    advance = partial(
+        act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
     )
-    last, (observations, poses, actions, results, outputs) = jax.lax.scan(
-        act_and_step, fleet, chance
-    )
+    last, (observations, poses, actions, results, outputs) = jax.lax.scan(advance, fleet, chance)
     reward, terminated, info = results
     episodes = Episodes(
         obs=jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), observations, last.obs),
@@ -143,7 +141,7 @@ def unroll(
     return last, episodes, trace
 
 
-def _act_and_step(
+def act_and_step(
     fleet: Fleet,
     chance: Chance,
     *,

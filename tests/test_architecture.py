@@ -31,6 +31,7 @@ RUN_LAYER = {
     "navigators",
     "planners",
     "policies",
+    "recording",
     "render",
     "report",
     "runlog",
@@ -38,11 +39,12 @@ RUN_LAYER = {
     "statistics",
     "train",
 }
-DEVICE_LAYER = {"config", "presets", "env", "agent", "rollout"}
+DEVICE_LAYER = {"config", "devices", "presets", "env", "agent", "rollout"}
 ARROWS: dict[str, set[str]] = {
     "config": set(),
     "presets": {"config"},
     "maps": set(),
+    "devices": {"config"},
     "env": {"config"},
     "agent": {"config"},
     "rollout": {"config", "env", "agent"},
@@ -71,7 +73,7 @@ DEVICE_LIBRARIES = {"chex", "flax", "jax", "jaxlib", "optax", "orbax"}
 PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING_ROOMS = {"figures", "render"}
 JIT_MODULES = {
-    *("sqn_jax.train", "sqn_jax.evaluate"),
+    *("sqn_jax.train", "sqn_jax.evaluate", "sqn_jax.recording"),
     *("experiments.bench_simulator", "experiments.bench_learner", "experiments.bench_breakdown"),
 }
 JIT_NAMES = {"jit", "pjit", "pmap"}
