@@ -5,6 +5,7 @@ gradient, clipping, Adam, target network, priorities. It is timed from episodes 
 with drawing them from a replay; several in one compiled scan, as in training. Where PyTorch is
 installed, `torch_sqn.py` makes updates of the first kind too, from the same parameters and
 episodes, and large float32 matrix products are timed in both libraries. All programs take turns.
+Where there are several devices, updates on one and on all of them are timed.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from experiments.operations import update_operations
 from experiments.timing import Program, Timing, four_digits, time_in_turns
-from sqn_jax import train
+from sqn_jax import devices, train
 from sqn_jax.agent import Episodes, QNetwork, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
 from sqn_jax.agent.loss import r2d2_loss
@@ -106,6 +108,7 @@ def update_from_drawn(
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
+    axis_name: str | None,
 ) -> tuple[LearnerState, tuple[Array, dict[str, Array]]]:
     """One update of `r2d2.learn` without drawing and storing.
 
@@ -115,6 +118,7 @@ def update_from_drawn(
         network: the agent.
         optimizer: of the learner.
         config: the run.
+        axis_name: of devices that each have their share of the batch.
 
     Returns:
         The new state, and priorities [B] and metrics.
@@ -124,38 +128,59 @@ def update_from_drawn(
     def loss_function(params: Any) -> Any:
         return r2d2_loss(params, state.target_params, network, episodes, weights, config.learner)
 
-    state, output, metrics = gradient_step(state, optimizer, loss_function)
+    state, output, metrics = gradient_step(state, optimizer, loss_function, axis_name)
     state = update_target(state, config.learner.target_update_rate)
     share = config.replay.max_priority_weight
     return state, (replay.sequence_priorities(output.td_errors, share), metrics)
 
 
-def drawn_program(problem: Problem) -> Program:
+def drawn_program(problem: Problem, mesh: Mesh | None) -> Program:
     """U updates from the problem's batches, in one compiled scan."""
-    update = partial(update_from_drawn, **_static(problem))
-    scan = jax.jit(partial(jax.lax.scan, update), donate_argnums=0)
+    update = partial(update_from_drawn, **_static(problem, mesh))
     batches = (problem.episodes, problem.weights)
-    return _carried_on(lambda state, turn: scan(state, batches), problem.learner)
-
-
-def sampling_program(problem: Problem) -> Program:
-    """U whole updates: draw by priority, learn, store the priorities."""
-    # The scan body of `r2d2.learn`, which without it would also store a round of new episodes.
-    update = partial(r2d2._update, **_static(problem), discount=None)
-    scan = jax.jit(partial(jax.lax.scan, update), donate_argnums=0)
-    num_updates = problem.weights.shape[0]
+    robots: Any = PartitionSpec(None, devices.AXIS)
+    steps: Any = PartitionSpec(None, None, devices.AXIS)
+    divided = (Episodes(steps, steps, steps, steps, robots), robots)
+    scan = _scan(update, mesh, WHOLE, divided, (robots, WHOLE))
+    placed = devices.place(batches, mesh, divided)
     return _carried_on(
-        lambda state, turn: scan(state, jax.random.split(jax.random.key(turn), num_updates)),
-        (problem.learner, problem.memory),
+        lambda state, turn: scan(state, placed), devices.place(problem.learner, mesh)
     )
 
 
-def _static(problem: Problem) -> dict[str, Any]:
+def sampling_program(problem: Problem, mesh: Mesh | None) -> Program:
+    """U whole updates: draw by priority, learn, store the priorities."""
+    # The scan body of `r2d2.learn`, which without it would also store a round of new episodes.
+    update = partial(r2d2._update, **_static(problem, mesh), discount=None)
+    held = (WHOLE, train.runner_specs(problem.config).memory)
+    scan = _scan(update, mesh, held, WHOLE, WHOLE)
+    num_updates = problem.weights.shape[0]
+    return _carried_on(
+        lambda state, turn: scan(state, jax.random.split(jax.random.key(turn), num_updates)),
+        devices.place((problem.learner, problem.memory), mesh, held),
+    )
+
+
+WHOLE = PartitionSpec()
+
+
+def _static(problem: Problem, mesh: Mesh | None) -> dict[str, Any]:
     return {
         "network": problem.network,
         "optimizer": problem.optimizer,
         "config": problem.config,
+        "axis_name": None if mesh is None else devices.AXIS,
     }
+
+
+def _scan(update: Any, mesh: Mesh | None, held: Any, given: Any, told: Any) -> Any:
+    """A compiled scan of updates; how state, inputs and results are divided between devices."""
+    scan = partial(jax.lax.scan, update)
+    if mesh is not None:
+        scan = jax.shard_map(
+            scan, mesh=mesh, in_specs=(held, given), out_specs=(held, told), check_vma=False
+        )
+    return jax.jit(scan, donate_argnums=0)
 
 
 def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Program:
@@ -287,8 +312,10 @@ def measure(
     }
     programs: dict[Name, Program] = {(PRODUCT, JAX): product_program(product_size)}
     for algo, problem in problems.items():
-        programs[algo, JAX] = drawn_program(problem)
-        programs[algo, SAMPLING] = sampling_program(problem)
+        for mesh in devices.one_and_all():
+            suffix = "" if mesh is None else f", {mesh.size} devices"
+            programs[algo, JAX + suffix] = drawn_program(problem, mesh)
+            programs[algo, SAMPLING + suffix] = sampling_program(problem, mesh)
     told: dict[str, Any] = {"updates_in_a_call": num_updates, "products_size": product_size}
     if torch_threads:
         programs |= torch_programs(problems.get("sqn"), torch_threads, product_size)

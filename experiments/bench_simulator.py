@@ -2,25 +2,54 @@
 
 Rays, coverage, reward and observation for ours; rays, reward and observation for JaxNav
 (`pip install jaxmarl`), with one robot, 71 beams of 5 m, with and without its reset in every step.
+Where there are several devices (the cores of a CPU are some: `devices.use_cores`), both are timed
+on one and on all of them.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 from jax import Array
+from jax.sharding import Mesh, PartitionSpec
 
 from experiments.timing import Program, time_in_turns
+from sqn_jax import devices
 from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
 from sqn_jax.scores import markdown_table
 
+Drive = Callable[[Array, Any, int], Any]
+"""Takes a key, what a world is made of, and a number of robots N; returns arrays [T, N, ...]."""
 
-@partial(jax.jit, static_argnames=("num_envs", "num_steps"))
-def drive_ours(key: Array, params: EnvParams, num_envs: int, num_steps: int) -> Any:
+
+def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Program:
+    """Robots on one device, or as many on each of several, with chance of their own."""
+    if mesh is None:
+        alone = jax.jit(drive, static_argnums=2)
+        return lambda turn: alone(jax.random.key(turn), world, num_envs)
+
+    def share(key: Array, world: Any) -> Any:
+        own_key = jax.random.fold_in(key, jax.lax.axis_index(devices.AXIS))
+        return drive(own_key, world, num_envs // mesh.size)
+
+    together = jax.jit(
+        jax.shard_map(
+            share,
+            mesh=mesh,
+            in_specs=(PartitionSpec(), PartitionSpec()),
+            out_specs=PartitionSpec(None, devices.AXIS),
+            check_vma=False,
+        )
+    )
+    placed = devices.place(world, mesh)
+    return lambda turn: together(jax.random.key(turn), placed)
+
+
+def drive_ours(key: Array, params: EnvParams, num_envs: int, *, num_steps: int) -> Any:
     """Observations and rewards of robots with random actions."""
     start_key, action_key, step_key = jax.random.split(key, 3)
     _, states = jax.vmap(reset, in_axes=(0, None))(jax.random.split(start_key, num_envs), params)
@@ -45,13 +74,8 @@ def draw_actions(
     return actions, jax.random.split(step_key, shape)
 
 
-def ours(params: EnvParams, num_envs: int, num_steps: int) -> Program:
-    """Our robots in one world."""
-    return lambda turn: drive_ours(jax.random.key(turn), params, num_envs, num_steps)
-
-
-def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
-    """The same for JaxNav; None where it is not installed."""
+def jaxnav(num_steps: int, *, resets: bool) -> Drive | None:
+    """The same for JaxNav, whose world is its own; None where it is not installed."""
     try:
         from jaxmarl.environments.jaxnav import JaxNav
     except ImportError:
@@ -59,8 +83,7 @@ def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
     world = JaxNav(num_agents=1, act_type="Discrete", lidar_num_beams=71, lidar_max_range=5.0)
     advance = world.step if resets else world.step_env
 
-    @jax.jit
-    def drive(key: Array) -> Any:
+    def drive(key: Array, _: Any, num_envs: int) -> Any:
         start_key, action_key, step_key = jax.random.split(key, 3)
         _, states = jax.vmap(world.reset)(jax.random.split(start_key, num_envs))
 
@@ -69,27 +92,29 @@ def jaxnav(num_envs: int, num_steps: int, *, resets: bool) -> Program | None:
             obs, states, reward, *_ = jax.vmap(advance)(keys, states, {"agent_0": actions})
             return states, (obs["agent_0"], reward["agent_0"])
 
-        return jax.lax.scan(body, states, draw_actions(action_key, step_key, num_steps, num_envs))[
-            1
-        ]
+        chance = draw_actions(action_key, step_key, num_steps, num_envs)
+        return jax.lax.scan(body, states, chance)[1]
 
-    return lambda turn: drive(jax.random.key(turn))
+    return drive
 
 
 def programs(
     maps: Sequence[str], counts: Sequence[int], num_steps: int
 ) -> dict[tuple[str, int], Program]:
     """What is timed, by name and number of robots."""
-    found: dict[tuple[str, int], Program] = {}
-    for name in maps:
-        params = make_env(name)
-        for count in counts:
-            found[f"sqn_jax, {name}", count] = ours(params, count, num_steps)
+    ours = partial(drive_ours, num_steps=num_steps)
+    drives: dict[str, tuple[Drive | None, Any]] = {
+        f"sqn_jax, {name}": (ours, make_env(name)) for name in maps
+    }
     for resets, name in ((False, "JaxNav"), (True, "JaxNav, reset in every step")):
-        for count in counts:
-            theirs = jaxnav(count, num_steps, resets=resets)
-            if theirs is not None:
-                found[name, count] = theirs
+        drives[name] = (jaxnav(num_steps, resets=resets), None)
+    found: dict[tuple[str, int], Program] = {}
+    for name, (drive, world) in drives.items():
+        for mesh in devices.one_and_all():
+            for count in counts:
+                if drive is not None and (mesh is None or count % mesh.size == 0):
+                    told = name if mesh is None else f"{name}, {mesh.size} devices"
+                    found[told, count] = program(drive, world, count, mesh)
     return found
 
 
@@ -105,7 +130,8 @@ def measure(
         repeats: turns.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # JaxNav's.
+        for category in (FutureWarning, UserWarning):  # JaxNav's.
+            warnings.simplefilter("ignore", category)
         timings = time_in_turns(programs(maps, counts, num_steps), repeats)
     return [
         {"program": name, "num_envs": count}
@@ -115,8 +141,12 @@ def measure(
 
 
 def table(entries: Sequence[dict[str, Any]]) -> str:
-    """Steps a second, and how many times those of JaxNav with as many robots."""
-    base = {e["num_envs"]: e["steps_per_second"] for e in entries if e["program"] == "JaxNav"}
+    """Steps a second, and how many times those of JaxNav at its best with as many robots."""
+    base: dict[int, float] = {}
+    for entry in entries:
+        if entry["program"].startswith("JaxNav"):
+            count, speed = entry["num_envs"], entry["steps_per_second"]
+            base[count] = max(speed, base.get(count, 0.0))
     rows = []
     for entry in entries:
         ratio = entry["steps_per_second"] / base.get(entry["num_envs"], float("nan"))

@@ -25,6 +25,7 @@ import jax
 import sqn_jax
 from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import ALGORITHMS, run
+from sqn_jax import devices
 from sqn_jax.env import make_env
 from sqn_jax.presets import PRESETS
 from sqn_jax.runlog import write_json
@@ -155,6 +156,7 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     """Parse the options, measure, write."""
     options = parse()
+    devices.use_cores()
     measures = {
         "simulator": simulator,
         "learner": learner,

@@ -71,9 +71,19 @@ def choose(config: TrainConfig, wanted: int | None = None) -> Mesh | None:
         _require(1 <= count <= len(available), count, f"1 to {len(available)} of this machine")
         sizes = f"num_envs ({config.num_envs}) and learner.batch_size ({config.learner.batch_size})"
         _require(_divides(count, config), count, f"a divisor of {sizes}")
+    return first(count)
+
+
+def first(count: int) -> Mesh | None:
+    """The first devices that there are, at least `count`; None stands for one alone."""
     if count == 1:
         return None
-    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=available[:count])
+    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=jax.devices()[:count])
+
+
+def one_and_all() -> list[Mesh | None]:
+    """One device alone and, where there are several, all of them: what a benchmark compares."""
+    return [first(count) for count in sorted({1, len(jax.devices())})]
 
 
 def _divides(count: int, config: TrainConfig) -> bool:

@@ -237,7 +237,7 @@ def _drive_and_learn(
 
 
 def train_chunk(
-    runner: RunnerState, env_params: EnvParams, config: TrainConfig, mesh: Mesh | None = None
+    runner: RunnerState, env_params: EnvParams, config: TrainConfig, mesh: Mesh | None
 ) -> tuple[RunnerState, dict[str, Array]]:
     """Scan over `rounds_per_chunk` rounds; nothing returns to the host in between.
 

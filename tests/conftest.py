@@ -1,4 +1,4 @@
-"""What holds for every test: the CPU, no silent broadcasting, the same examples in every run.
+"""What holds for every test: two CPU devices, no silent broadcasting, the same examples each time.
 
 Nor do tests read or write compiled programs in the user's cache folder.
 """
@@ -16,6 +16,9 @@ os.environ.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
 
 import hypothesis
 import jax
+
+# As many devices on every machine, for the tests that divide a run; the others use the first.
+jax.config.update("jax_num_cpu_devices", 2)
 
 # One computation at a time: several in flight would wait for each other's threads on two cores.
 jax.config.update("jax_cpu_enable_async_dispatch", False)

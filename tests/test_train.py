@@ -91,7 +91,7 @@ def all_chunks(
     """Train to the end with the jitted program; the final state and the metrics of all rounds."""
     metrics = []
     for _ in range(config.num_chunks):
-        runner, chunk = train.compiled_train_chunk(runner, world, config)
+        runner, chunk = train.compiled_train_chunk(runner, world, config, None)
         metrics.append(jax.device_get(chunk))
     return runner, metrics
 
@@ -123,7 +123,7 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
         runner, metrics, traces = train.start_run(world, config), [], []
         keys = [tuple(numbers(runner.key)[0].tolist())]
         for _ in range(config.num_chunks):
-            runner, chunk = train.compiled_train_chunk(runner, world, config)
+            runner, chunk = train.compiled_train_chunk(runner, world, config, None)
             metrics.append(jax.device_get(chunk))
             traces.append(count)
             keys.append(tuple(numbers(runner.key)[0].tolist()))
@@ -229,7 +229,7 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
         ):
             np.testing.assert_allclose(one[index], other, atol=1e-5)
     with compiling_quickly():
-        _, metrics = train.compiled_train_chunk(runners, smoke.world, config)
+        _, metrics = train.compiled_train_chunk(runners, smoke.world, config, None)
     for index, alone in enumerate((smoke.metrics[0], other_seed[1][0])):
         for name in METRICS:
             np.testing.assert_allclose(
@@ -239,7 +239,7 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
 
 def test_the_state_given_to_a_chunk_is_donated(either: Trained) -> None:
     runner = train.start_run(either.world, either.config)
-    new_runner, _ = train.compiled_train_chunk(runner, either.world, either.config)
+    new_runner, _ = train.compiled_train_chunk(runner, either.world, either.config, None)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(either.world))

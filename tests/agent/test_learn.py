@@ -205,8 +205,8 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
     drawn, weights = np.array([4, 1, 4]), np.array([0.5, 1.0, 0.5])
     asked: list[dict[str, Any]] = []
 
-    def fixed_sample(key: Any, memory: Any, batch_size: int, **exponents: float) -> Any:
-        asked.append({"batch_size": batch_size, **exponents})
+    def fixed_sample(key: Any, memory: Any, batch_size: int, **settings: Any) -> Any:
+        asked.append({"batch_size": batch_size, **settings})
         items = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[drawn], memory.storage)
         return items, jnp.asarray(drawn), jnp.asarray(weights, jnp.float32)
 
@@ -218,7 +218,8 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
     new_state, new_memory, metrics = learn_with(r2d2, config)(
         jax.random.key(0), state, memory, episodes, discount=jnp.float32(0.6)
     )
-    assert asked[0] == {"batch_size": 3, "priority_exponent": 0.9, "importance_exponent": 0.6}
+    exponents = {"priority_exponent": 0.9, "importance_exponent": 0.6}
+    assert asked[0] == {"batch_size": 3, **exponents, "axis_name": None}
 
     # As stored: coarser observations, and an episode begins without a memory.
     coarse = episodes.replace(
@@ -282,12 +283,12 @@ def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Updates of two out of twelve: were the key used again, two priorities at most would move."""
-    asked: list[dict[str, float]] = []
+    asked: list[dict[str, Any]] = []
     true_sample = replay.sample
 
-    def noting_sample(*args: Any, **exponents: float) -> Any:
-        asked.append(exponents)
-        return true_sample(*args, **exponents)
+    def noting_sample(*args: Any, **settings: Any) -> Any:
+        asked.append(settings)
+        return true_sample(*args, **settings)
 
     monkeypatch.setattr(r2d2.replay, "sample", noting_sample)
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False))
@@ -295,8 +296,9 @@ def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told(
     episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
     memory = replay.add(replay.init(r2d2.packed_item(episodes), 12, 6), r2d2.pack(episodes))
     _, after, _ = learn_with(r2d2, config)(jax.random.key(2), state, memory, episodes)
-    assert {"priority_exponent": 0.0, "importance_exponent": 0.0} in asked
-    assert all(exponents == asked[0] for exponents in asked)
+    uniform = {"priority_exponent": 0.0, "importance_exponent": 0.0, "axis_name": None}
+    assert asked
+    assert all(settings == uniform for settings in asked)
     before = replay.add(memory, r2d2.pack(episodes)).priorities
     assert 4 <= (np.asarray(after.priorities) != np.asarray(before)).sum() <= 12
 
