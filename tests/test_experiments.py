@@ -72,7 +72,7 @@ def test_both_scripts_at_a_tiny_budget(
 
 
 def test_the_benchmark_times_every_simulator_and_writes_what_it_prints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--parts", "simulator", "--maps", "maze", "--envs", "2", "3", "--steps", "4"]
     words += ["--repeats", "3", "--out", str(tmp_path / "speed.json")]
@@ -87,7 +87,7 @@ def test_the_benchmark_times_every_simulator_and_writes_what_it_prints(
     divided = "sqn_jax, maze, 2 devices"  # Three robots cannot be.
     both = [entry for entry in found["simulator"] if entry["program"] == divided]
     assert [entry["num_envs"] for entry in both] == [2]
-    printed = capsys.readouterr().out
+    printed = capfd.readouterr().out
     for entry in ours:
         assert 0 < entry["slowest"] <= entry["steps_per_second"] <= entry["fastest"]
         assert f"{entry['steps_per_second']:,}" in printed
