@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+from jax.sharding import SingleDeviceSharding
 
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.networks import Params
@@ -56,9 +57,7 @@ class Checkpoints:
             ValueError: there is no checkpoint.
         """
         step = self._require_step()
-        shapes = _split(runner_shapes)
-        items = {name: ocp.args.StandardRestore(item) for name, item in shapes.items()}
-        return _join(self._restored(step, items))
+        return _join(self._restored(step, _split(runner_shapes)))
 
     def restore_policy(self, params_shapes: Params, *, averaged: bool) -> Params:
         """Load only the parameters to evaluate, from the newest checkpoint.
@@ -73,9 +72,14 @@ class Checkpoints:
         """
         step = self._require_step()
         name = "target_params" if averaged else "params"
-        return self._restored(step, {name: ocp.args.StandardRestore(params_shapes)})[name]
+        return self._restored(step, {name: params_shapes})[name]
 
-    def _restored(self, step: int, items: dict[str, Any]) -> Any:
+    def _restored(self, step: int, shapes: dict[str, Any]) -> Any:
+        """Items of the given shapes; on the first device where these do not name any.
+
+        Wherever the arrays lay when they were saved: a run on two devices goes on on one.
+        """
+        items = {name: ocp.args.StandardRestore(_placed(item)) for name, item in shapes.items()}
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**items))
         except Exception as error:  # Orbax raises bare exceptions, too.
@@ -108,6 +112,16 @@ def _split(runner: RunnerState) -> dict[str, Any]:
         "rest": {name: value for name, value in rest.items() if value is not None},
     }
     return {name: item for name, item in items.items() if item is not None}
+
+
+def _placed(shapes: Any) -> Any:
+    first = SingleDeviceSharding(jax.devices()[0])
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(
+            x.shape, x.dtype, sharding=getattr(x, "sharding", None) or first
+        ),
+        shapes,
+    )
 
 
 def _key_data(key: Any) -> Any:

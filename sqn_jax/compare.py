@@ -272,10 +272,10 @@ def evaluate_agents(
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
     quiet: dict[str, list[list[Outcome]]] = {agent.name: [] for agent in agents}
-    robots = {agent.name: _robot(agent.env_config, settings) for agent in agents}
+    robots = {agent.name: robot_for(agent.env_config, settings) for agent in agents}
     for robot in dict.fromkeys(robots.values()):
         ways: dict[bytes, NDArray[np.float64]] = {}
-        for world in _worlds(robot, maps, settings):
+        for world in worlds(robot, maps, settings):
             for agent in (agent for agent in agents if robots[agent.name] == robot):
                 outcomes = _outcomes(agent, world, settings, ways, on_batch, on_driven)
                 for radius, of_radius in outcomes.items():
@@ -293,7 +293,7 @@ def evaluate_agents(
     return {"schema": 1, "results": results, "comparisons": comparisons}, records
 
 
-def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
+def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     """The robot and its sensors, without what belongs to training or comes from the settings."""
     return dataclasses.replace(
         env_config,
@@ -306,7 +306,8 @@ def _robot(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     )
 
 
-def _worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
+def worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
+    """Every map, task and noise of an evaluation for a robot from `robot_for`."""
     for name in settings.maps:
         occupancy_map = maps[name, robot.robot_radius]
         for tasks in settings.tasks:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +18,9 @@ from rooms import small_room
 
 from sqn_jax import devices, train
 from sqn_jax.agent import shares
+from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
+from sqn_jax.policies import params_shapes
 from sqn_jax.presets import PRESETS
 
 LENGTH = 12
@@ -118,6 +121,29 @@ def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_se
         jax.tree.map(
             lambda x, y: np.testing.assert_allclose(y, x, atol=1e-3), one.memory, two.memory
         )
+
+
+@pytest.mark.parametrize("method", ["pqn", "r2d2"])
+def test_a_run_saved_on_two_devices_goes_on_and_is_evaluated_on_one(
+    mesh: Mesh, method: Any, tmp_path: Path
+) -> None:
+    config = config_for(method)
+    world = small_room(LENGTH)
+    runner = train.start_run(world, config, mesh)
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, runner)
+        alone = checkpoints.restore(train.runner_shapes(world, config, None))
+        again = checkpoints.restore(train.runner_shapes(world, config, mesh))
+        params = checkpoints.restore_policy(params_shapes(config), averaged=train.averages(config))
+    for found, where in ((alone, 1), (again, 2)):
+        for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(runner), strict=True):
+            if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+                np.testing.assert_array_equal(x, y)
+        assert len(jax.tree.leaves(found.learner.params)[0].sharding.device_set) == where
+    expected = train.policy_params(runner.learner, config)
+    jax.tree.map(np.testing.assert_array_equal, params, expected)
+    for leaf in jax.tree.leaves(params):
+        assert leaf.sharding.device_set == {jax.devices()[0]}
 
 
 def chosen_count(num_envs: int, batch_size: int, wanted: int | None = None) -> int:

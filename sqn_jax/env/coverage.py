@@ -109,6 +109,23 @@ class Lattice:
         u, v = (columns - self.origin[0]) * self.cell, (rows - self.origin[1]) * self.cell
         return np.stack(np.broadcast_arrays(*_turn(u, v, back=True)), axis=-1)
 
+    def nearest_point(
+        self, x: NDArray[np.floating], y: NDArray[np.floating]
+    ) -> tuple[NDArray[np.intp], ...]:
+        """Where in `points` the point nearest to each place on the map stands.
+
+        Args:
+            x: m, any shape.
+            y: m, the same shape.
+
+        Returns:
+            Indices of words, groups, group_rows and bits, of that shape each.
+        """
+        u, v = _turn(x, y)
+        column = np.rint(u / self.cell + self.origin[0]).astype(np.intp)
+        row = np.rint(v / self.cell + self.origin[1]).astype(np.intp)
+        return column // 32, row // self.group_rows, row % self.group_rows, column % 32
+
     def on_map(self) -> NDArray[np.uint32]:
         """The points that lie on the map, as a `covered` array; a sector may reach beyond it."""
         x, y = np.moveaxis(self.points(), -1, 0)
