@@ -21,19 +21,12 @@ from experiments.common import (
 )
 from sqn_jax import figures
 from sqn_jax.compare import Settings, group_policies, with_references
+from sqn_jax.paper import PAPER_RESULTS
 from sqn_jax.policies import load_policy
 from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.runlog import RunFolder
 from sqn_jax.scores import markdown_table, results_table
 from sqn_jax.session import evaluate_session
-
-PAPER = {
-    "dqn": ((0.72, 253.0), (0.95, 151.5), (0.97, 167.0), (0.38, 1061.4)),
-    "r2d2": ((0.70, 257.8), (0.99, 172.4), (0.91, 221.8), (0.64, 937.7)),
-    "sqn": ((0.98, 181.1), (0.99, 148.7), (0.93, 171.4), (0.82, 767.5)),
-}
-"""Success and time steps on `PAPER_MAPS`, table I of the paper, whose own maps are not published:
-ours are others."""
 
 
 def paper_table(results: list[dict[str, Any]]) -> str:
@@ -51,8 +44,8 @@ def paper_table(results: list[dict[str, Any]]) -> str:
                 if (entry["agent"], entry["map"], entry["goal_radius"]) == (agent, name, radius)
             )
             told = f"{_spread(entry['success'], 2)}, {_spread(entry['time_steps'], 1)}"
-            if name in PAPER_MAPS and entry["algorithm"] in PAPER:
-                success, steps = PAPER[entry["algorithm"]][PAPER_MAPS.index(name)]
+            if name in PAPER_RESULTS.get(entry["algorithm"], {}):
+                success, steps = PAPER_RESULTS[entry["algorithm"]][name]
                 told += f" (paper {success:.2f}, {steps:.1f})"
             row.append(told)
         rows.append(row)

@@ -1,4 +1,4 @@
-"""The command line: `sqn train`, `sqn evaluate` and `sqn map check`.
+"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`.
 
 It wires words to functions, no more.
 
@@ -38,6 +38,8 @@ USAGE = """usage: sqn COMMAND [OPTIONS]
 
   sqn train              train a robot, evaluate it, and draw what it did
   sqn evaluate RUN ...   compare trained robots on any maps, with noise, beside references
+  sqn report RUN ...     the same as a page with pictures, what went worst first
+  sqn render RUN ...     films and pictures of what trained robots do on a map
   sqn map check FILE     say what a map offers, or what is wrong with it
 
 `sqn COMMAND --help` lists the options of a command.
@@ -95,6 +97,7 @@ def _train(words: list[str]) -> int:
     parser.add_argument("--run-dir", "--run_dir", type=_folder)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--num-devices", "--num_devices", type=int)
+    parser.add_argument("--tensorboard", action="store_true")
     own, others = parser.parse_known_args(words)
     if own.resume:
         if own.run_dir is None:
@@ -102,16 +105,16 @@ def _train(words: list[str]) -> int:
         if others or own.preset:
             raise ValueError(
                 "--resume takes every setting from the run folder, expected no option but "
-                f"--run-dir and --num-devices, got {' '.join(others) or '--preset'}"
+                f"--run-dir, --num-devices and --tensorboard, got {' '.join(others) or '--preset'}"
             )
         from sqn_jax.runlog import RunFolder
 
         _, config = RunFolder.open(own.run_dir)
-        return _run_training(config, own.run_dir, resume=True, num_devices=own.num_devices)
+        return _run_training(config, own.run_dir, own)
     preset = own.preset or "quick"
     config = _parse_config(others, preset)
     run_dir = own.run_dir or _default_run_dir(config, preset)
-    return _run_training(config, run_dir, resume=False, num_devices=own.num_devices)
+    return _run_training(config, run_dir, own)
 
 
 def _folder(word: str) -> Path:
@@ -129,7 +132,8 @@ def _parse_config(words: list[str], preset: str) -> TrainConfig:
         f"--preset {{{','.join(PRESETS)}}} (default quick) chooses the defaults shown here, "
         "--run-dir DIR where to write (default runs/NAME), --resume goes on with --run-dir, "
         "--num-devices N divides the robots between N cores of the CPU or N accelerators (default "
-        "as many cores as help, or one accelerator). "
+        "as many cores as help, or one accelerator), --tensorboard writes for TensorBoard into "
+        "the run folder. "
         f"{CACHE}"
     )
     told = io.StringIO()
@@ -168,14 +172,18 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
     return Path("runs") / f"{stamp}_{config.algo}_{Path(config.map).stem}_{preset}"
 
 
-def _run_training(
-    config: TrainConfig, run_dir: Path, *, resume: bool, num_devices: int | None
-) -> int:
+def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -> int:
     from sqn_jax.session import Stopped, train_session
 
     config = _with_absolute_map(config)
     try:
-        train_session(config, run_dir, resume=resume, num_devices=num_devices)
+        train_session(
+            config,
+            run_dir,
+            resume=own.resume,
+            num_devices=own.num_devices,
+            tensorboard=own.tensorboard,
+        )
     except Stopped as stop:
         print(f"saved; go on with `sqn train --run-dir {run_dir} --resume`", file=sys.stderr)
         return stop.exit_code
@@ -198,7 +206,7 @@ def _evaluate(words: list[str]) -> int:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("runs", nargs="*", type=Path, metavar="RUN", help="run folders; equal ones but for seeds")
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
     add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
     add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
@@ -213,9 +221,9 @@ def _evaluate(words: list[str]) -> int:
     add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
     options = parser.parse_args(words)
     if not options.runs and options.no_references:
-        raise ValueError("nothing to evaluate: name a run folder")
+        raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax import compare
-    from sqn_jax.policies import load_policy
+    from sqn_jax.pretrained import find_policy
     from sqn_jax.scores import results_table
     from sqn_jax.session import evaluate_session
 
@@ -234,7 +242,7 @@ def _evaluate(words: list[str]) -> int:
     )
     if options.out is not None:
         _require_writable(options.out)
-    learnt = compare.group_policies([load_policy(path) for path in options.runs])
+    learnt = compare.group_policies([find_policy(word) for word in options.runs])
     agents = compare.with_references(learnt, references=not options.no_references)
     evaluation = evaluate_session(agents, settings, options.out)
     print(results_table(evaluation["results"]))
@@ -246,6 +254,97 @@ def _evaluate(words: list[str]) -> int:
         )
     if options.out is not None:
         print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
+    return 0
+
+
+def _report(words: list[str]) -> int:
+    parser = _Parser(
+        prog="sqn report",
+        description="Drive greedy episodes of trained policies and write one page about them: "
+        "what went worst, success and time steps, curves, paths, an animation, settings.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("--maps", nargs="+", help="names or files (default: the map of the first run)")
+    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=1, help="how many evaluation seeds (default 1)")
+    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add("--out", type=Path, default=Path("report.html"), help="default: report.html")
+    options = parser.parse_args(words)
+    if not options.runs:
+        raise ValueError("nothing to report on: name a run folder or pretrained:NAME")
+    try:
+        from sqn_jax import report
+    except ModuleNotFoundError as error:
+        if error.name != "matplotlib":
+            raise
+        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    from sqn_jax.compare import Settings
+
+    report.require_writable(options.out)
+    runs = report.read_runs(options.runs)
+    config = runs[0].policy.config
+    settings = Settings(
+        maps=tuple(options.maps or [config.map]),
+        tasks=tuple(TASKS[word] for word in options.tasks),
+        episodes=options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        goal_radii=(config.env.goal_radius,),
+    )
+    report.write_report(runs, settings, options.out, references=not options.no_references)
+    print(f"wrote {options.out}")
+    return 0
+
+
+def _render(words: list[str]) -> int:
+    parser = _Parser(
+        prog="sqn render",
+        description="Drive greedy episodes of trained policies on a map and write what they did: "
+        "films (GIF), the paths of all side by side and timelines.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("--map", default="maze", help="a name or a file (default maze)")
+    add("--episodes", type=int, default=4, help="of each policy (default 4)")
+    add("--tasks", choices=list(TASKS), default="points", help="default: points")
+    add("--animations", type=int, default=1, help="films of each policy (default 1)")
+    add("--seed", type=int, default=1_000, help="the evaluation seed (default 1000)")
+    add("--velocity-noise", type=float, default=0.0, metavar="S", help="e.g. 0.1")
+    add("--range-noise", type=float, default=0.0, metavar="P", help="e.g. 0.2")
+    add("--max-steps", type=int, default=0, help="steps an episode (default: as the map says)")
+    add("--mp4", action="store_true", help="write films as MP4, too; needs sqn_jax[video]")
+    add("--out", type=_folder, metavar="DIR", help="default: renders/NAME_MAP, NAME the run's")
+    options = parser.parse_args(words)
+    if not options.runs:
+        raise ValueError("nothing to render: name a run folder or pretrained:NAME")
+    from sqn_jax.pretrained import find_policy
+
+    try:
+        from sqn_jax import render
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("matplotlib"):
+            raise
+        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    policies = [find_policy(word) for word in options.runs]
+    render.render_session(
+        policies,
+        options.out or render.default_folder(policies, options.map),
+        map_name=options.map,
+        tasks=TASKS[options.tasks],
+        episodes=options.episodes,
+        animations=options.animations,
+        seed=options.seed,
+        noise=(options.velocity_noise, options.range_noise),
+        max_steps=options.max_steps,
+        mp4=options.mp4,
+    )
     return 0
 
 
@@ -282,5 +381,7 @@ def _map(words: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "evaluate": _evaluate,
+    "report": _report,
+    "render": _render,
     "map": _map,
 }

@@ -8,8 +8,8 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -39,6 +39,7 @@ from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies import Policy, seeds_of
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder, write_json, write_records
+from sqn_jax.tensorboard import Board, require_tensorboard
 from sqn_jax.train import (
     ChunkReport,
     RunnerState,
@@ -62,7 +63,12 @@ class Stopped(Exception):
 
 @kept_programs()
 def train_session(
-    config: TrainConfig, run_dir: Path, *, resume: bool = False, num_devices: int | None = None
+    config: TrainConfig,
+    run_dir: Path,
+    *,
+    resume: bool = False,
+    num_devices: int | None = None,
+    tensorboard: bool = False,
 ) -> None:
     """Train, evaluate and draw, telling the terminal about it.
 
@@ -71,9 +77,11 @@ def train_session(
         run_dir: where everything goes.
         resume: go on from the newest checkpoint in `run_dir`.
         num_devices: see `devices.choose`.
+        tensorboard: write metrics and pictures for TensorBoard, too.
 
     Raises:
-        ValueError: the map, the folder or the number of devices is unusable.
+        ValueError: the map, the folder or the number of devices is unusable, or tensorboardX is
+            asked for and not installed.
         Stopped: by SIGINT or SIGTERM, after the chunk was finished and saved.
     """
     devices.use_cores()
@@ -82,19 +90,27 @@ def train_session(
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
     num_windows(config, env_params)
+    if tensorboard:
+        require_tensorboard()
     folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
     _announce(config, env_params, run_dir, mesh)
-    with Checkpoints(run_dir) as checkpoints:
+    with Checkpoints(run_dir) as checkpoints, ExitStack() as stack:
         if resume:
             shapes = runner_shapes(env_params, config, mesh)
             runner, seconds_before = _restored(shapes, config, folder, checkpoints)
         else:
             runner, seconds_before = start_run(env_params, config, mesh), 0.0
+        done = int(np.max(np.asarray(runner.round))) * config.num_envs
+        board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
+        on_row = None if board is None else board.scalars
         runner, timing = _train(
-            runner, env_params, config, folder, checkpoints, seconds_before, mesh
+            runner, env_params, config, folder, checkpoints, seconds_before, mesh, on_row
         )
-    results, drawn = _evaluate(runner, occupancy_map, config, folder)
-    figures = _draw(drawn, occupancy_map, config, folder)
+        results, drawn = _evaluate(runner, occupancy_map, config, folder)
+        figures = _draw(drawn, occupancy_map, config, folder)
+        if board is not None and figures:
+            for path in sorted(folder.figures.glob("*.png")):
+                board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
     _conclude(results, timing, figures, config, folder)
 
 
@@ -137,6 +153,7 @@ def _train(
     checkpoints: Checkpoints,
     seconds_before: float,
     mesh: Mesh | None,
+    on_row: Callable[[dict[str, Any]], None] | None,
 ) -> tuple[RunnerState, dict[str, float]]:
     """Drive the training to its end; returns the final state and how long it took."""
     timing: dict[str, float] = {"train_seconds": seconds_before, "env_steps": 0.0}
@@ -157,6 +174,8 @@ def _train(
             timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
             row = _row(report, timing["train_seconds"], env_params, config)
             folder.append_metrics(row)
+            if on_row is not None:
+                on_row(row)
             bar.set_postfix_str(_postfix(row), refresh=False)
             bar.update(episodes_a_chunk)
             if received or time.monotonic() - last_saved > 60 * config.checkpoint_minutes:

@@ -28,15 +28,19 @@ RUN_LAYER = {
     "evaluate",
     "export",
     "figures",
+    "interventions",
     "navigators",
+    "paper",
     "planners",
     "policies",
+    "pretrained",
     "recording",
     "render",
     "report",
     "runlog",
     "scores",
     "statistics",
+    "tensorboard",
     "train",
 }
 DEVICE_LAYER = {"config", "devices", "presets", "env", "agent", "rollout"}
@@ -50,8 +54,11 @@ ARROWS: dict[str, set[str]] = {
     "rollout": {"config", "env", "agent"},
     **{room: RUN_LAYER | DEVICE_LAYER | {"maps"} for room in RUN_LAYER},
     "sqn_jax": RUN_LAYER | DEVICE_LAYER | {"maps"},
-    # Known to session only: who imports the library gets no cache on disk.
+    "paper": {"config", "presets"},
+    # Known to session, render and report only: who imports the library gets no cache on disk.
     "compilation": {"runlog"},
+    "render": RUN_LAYER | DEVICE_LAYER | {"maps", "compilation"},
+    "report": RUN_LAYER | DEVICE_LAYER | {"maps", "compilation"},
     "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax", "compilation"},
     "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
     "__main__": {"cli"},
@@ -75,6 +82,7 @@ PLOTTING_ROOMS = {"figures", "render"}
 JIT_MODULES = {
     *("sqn_jax.train", "sqn_jax.evaluate", "sqn_jax.recording"),
     *("experiments.bench_simulator", "experiments.bench_learner", "experiments.bench_breakdown"),
+    "notebooks.01_first_steps",
 }
 JIT_NAMES = {"jit", "pjit", "pmap"}
 UNSAFE_IMPORTS = {

@@ -99,7 +99,7 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     straight, broken = tmp_path / "straight", tmp_path / "broken"
-    assert main(["train", *TINY, "--run-dir", str(straight)]) == 0
+    assert main(["train", *TINY, "--tensorboard", "--run-dir", str(straight)]) == 0
     told = capsys.readouterr().out
     assert "evaluation points:" in told
     assert "random pairs:" in told
@@ -136,6 +136,9 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     for tasks in ("evaluation points", "random pairs"):
         reached = [record["success"] for record in records if record["tasks"] == tasks]
         assert summary[tasks.replace(" ", "_")]["success"] == np.mean(reached)
+    (board,) = (straight / "tensorboard").iterdir()
+    for tag in (b"mean_reward", b"trajectories_evaluation_points", b"learning_curve"):
+        assert tag in board.read_bytes()
     drawn = sorted(path.name for path in (straight / "figures").iterdir())
     assert drawn == [
         "learning_curve.png",

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
+from episodes import episode
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Circle, Polygon
+from test_figures import check_texts
 
 from sqn_jax import figures
+from sqn_jax.figures.gallery import spread_steps
 from sqn_jax.maps import load_map
 
 
@@ -79,3 +85,113 @@ def test_the_gallery_has_a_panel_a_map_in_metres() -> None:
     assert marks == [tuple(point) for point in maps[0].evaluation_points]
     with pytest.raises(ValueError, match="no maps"):
         figures.map_gallery([])
+
+
+def test_a_pattern_is_the_scan_in_the_robots_frame_with_ahead_to_the_right() -> None:
+    """8 beams 50 degrees apart, the first 175 degrees to the right of the heading."""
+    one = episode(arrival=20)
+    figure = figures.observation_patterns([one], scans=1)
+    above, pattern = figure.axes
+    (outline,) = [p.get_xy() for p in pattern.patches if isinstance(p, Polygon)][:1]
+    angles = [math.radians(-175 + 50 * beam) for beam in range(8)]
+    ends = [
+        (reach * math.cos(angle), reach * math.sin(angle))
+        for reach, angle in zip(one.ranges[0], angles, strict=True)
+    ]
+    np.testing.assert_allclose(outline[:8], ends)
+    np.testing.assert_allclose(outline[8], (0.0, 0.0))
+    # Beam 1, 125 degrees to the right, looks back and down; beam 6, to the left, back and up.
+    assert outline[1][0] < 0 > outline[1][1]
+    assert outline[6][0] < 0 < outline[6][1]
+    (circle,) = [patch for patch in pattern.patches if isinstance(patch, Circle)]
+    assert circle.radius == 5.0
+    assert pattern.get_xlim()[0] < -5 < 5 < pattern.get_xlim()[1]
+    assert tuple(above.lines[0].get_xydata()[0]) == (0.5, 0.6)
+
+
+def test_each_map_has_its_patterns_and_letters_say_where_they_were_taken() -> None:
+    episodes = [episode(arrival=20), episode(arrival=30)]
+    figure = figures.observation_patterns(episodes, scans=3)
+    maps = [axes for axes in figure.axes if axes.get_title()]
+    assert [axes.get_title() for axes in maps] == ["room, 6 x 4 m"] * 2
+    assert len(figure.axes) == 2 * (1 + 3)
+    for axes, last in zip(maps, (20, 30), strict=True):
+        letters = {text.get_text(): text.get_position() for text in axes.texts}
+        assert list(letters) == ["A", "B", "C"]
+        # 0.1 m a step along a line: the start, midway, and the arrival.
+        assert [x for x, _ in letters.values()] == pytest.approx(
+            [0.5, 0.5 + last / 20, 0.5 + last / 10]
+        )
+    FigureCanvasAgg(figure).draw()
+    check_texts(figure)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_places_are_spread_as_a_search_through_all_of_them_spreads_them(count: int) -> None:
+    rng = np.random.default_rng(0)
+    one = episode(poses=rng.uniform(0, 5, size=(31, 3)), arrival=25)
+    chosen = [0]
+    while len(chosen) < count:
+        gaps = [
+            min(math.dist(one.poses[i, :2], one.poses[j, :2]) for j in chosen) for i in range(26)
+        ]
+        chosen.append(gaps.index(max(gaps)))
+    assert spread_steps(one, count) == sorted(chosen)
+
+
+@pytest.mark.parametrize("scans", [0, 7])
+def test_patterns_without_episodes_or_with_too_many_scans_are_refused(scans: int) -> None:
+    with pytest.raises(ValueError, match=f"scans is {scans}, expected 1 to 6"):
+        figures.observation_patterns([episode()], scans=scans)
+    with pytest.raises(ValueError, match="no episodes"):
+        figures.observation_patterns([])
+
+
+def gate_rows(entropies: list[Any], skills: int = 2, **more: list[Any]) -> list[dict[str, Any]]:
+    told = [
+        {"episodes": 100 * k, "gate_entropy": entropy, "skill_usage": [1 / skills] * skills}
+        for k, entropy in enumerate(entropies, start=1)
+    ]
+    for name, values in more.items():
+        told = [row | {name: value} for row, value in zip(told, values, strict=True)]
+    return told
+
+
+def test_the_entropy_is_a_share_of_what_the_number_of_skills_allows() -> None:
+    """log 2 = 0.6931 and log 4 = 1.3863 nat are 1; NaN, before the first update, leaves a gap."""
+    runs = {
+        "two": gate_rows([math.nan, 0.69314718, 0.34657359], skill_distance=[None, 0.2, 0.4]),
+        "four": gate_rows([1.38629436, 0.69314718], skills=4),
+    }
+    figure = figures.gate_entropy(runs, title="gates")
+    FigureCanvasAgg(figure).draw()
+    entropy, distance = figure.axes
+    np.testing.assert_allclose(entropy.lines[0].get_ydata(), [np.nan, 1.0, 0.5])
+    np.testing.assert_allclose(entropy.lines[1].get_ydata(), [1.0, 0.5])
+    np.testing.assert_allclose(entropy.lines[1].get_xdata(), [100, 200])
+    (line,) = distance.lines
+    np.testing.assert_allclose(line.get_ydata(), [np.nan, 0.2, 0.4])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["two", "four"]
+    check_texts(figure)
+
+
+def test_runs_that_do_not_know_the_distance_have_one_panel_and_seeds_are_thin() -> None:
+    rows = gate_rows([[0.2, 0.4], [0.1, 0.3]])
+    (axes,) = figures.gate_entropy({"SQN": rows}, title="gates").axes
+    *thin, bold = axes.lines
+    assert len(thin) == 2
+    np.testing.assert_allclose(bold.get_ydata(), np.array([0.3, 0.2]) / 0.6931471805599453)
+
+
+@pytest.mark.parametrize(
+    ("runs", "named"),
+    [
+        ({}, "no runs"),
+        ({"a": []}, "run a: 0 rows"),
+        ({"a": [{"episodes": 1, "skill_usage": [1, 0]}]}, "run a: 1 rows.*gate_entropy"),
+        ({"a": gate_rows([0.0], skills=1)}, "run a has 1 skill"),
+    ],
+)
+def test_runs_without_a_skill_decision_are_refused_by_name(runs: Any, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        figures.gate_entropy(runs, title="none")

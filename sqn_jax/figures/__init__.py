@@ -1,22 +1,39 @@
 """Pictures of recorded data, one function each: from NumPy arrays or rows to a Matplotlib figure.
 
-No pyplot, no display, no global state: a figure belongs to nobody until `save` writes it as PNG.
+No pyplot, no display, no global state: a figure belongs to nobody until `save` writes it as PNG or
+`picture` hands it to a notebook. Films are drawn by `frames`, `gif` and `mp4`.
 """
 
-from sqn_jax.figures.curves import learning_curve, learning_curves
-from sqn_jax.figures.gallery import map_gallery
+from sqn_jax.figures.animation import frames, gif, mp4
+from sqn_jax.figures.curves import gate_entropy, learning_curve, learning_curves
+from sqn_jax.figures.episode import coverage_example, reachability_example
+from sqn_jax.figures.gallery import map_gallery, observation_patterns
 from sqn_jax.figures.noise import robustness
 from sqn_jax.figures.paths import MAX_PATHS, trajectories
-from sqn_jax.figures.style import DPI, WIDTH_IN, save
+from sqn_jax.figures.skills import agents_side_by_side, skill_trajectories
+from sqn_jax.figures.style import DPI, WIDTH_IN, Picture, picture, save
+from sqn_jax.figures.timeline import episode_timeline
 
 __all__ = [
     "DPI",
     "MAX_PATHS",
     "WIDTH_IN",
+    "Picture",
+    "agents_side_by_side",
+    "coverage_example",
+    "episode_timeline",
+    "frames",
+    "gate_entropy",
+    "gif",
     "learning_curve",
     "learning_curves",
     "map_gallery",
+    "mp4",
+    "observation_patterns",
+    "picture",
+    "reachability_example",
     "robustness",
     "save",
+    "skill_trajectories",
     "trajectories",
 ]

@@ -191,3 +191,57 @@ def _draw_band(
     if values.shape[1] > 1:
         low, high = np.array([bootstrap_interval(row, resamples=400) for row in values]).T
         axes.fill_between(episodes, low, high, color=colour, alpha=0.2, lw=0)
+
+
+def gate_entropy(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
+    """Draw how decided the skill decision became in training, and how different the skills.
+
+    Args:
+        rows_by_run: for each run the objects of its `metrics.jsonl`, with `episodes` (cumulative),
+            `gate_entropy` (nat) and `skill_usage` ([K] or [seeds, K], for the number of skills);
+            `skill_distance` is drawn where present. Numbers, or lists with one a training seed:
+            then every seed is a thin line and their mean a bold one. NaN and None leave a gap.
+        title: stands above the panels.
+
+    Returns:
+        Left the entropy as a share of its maximum, log K: 1 mixes all skills evenly, 0 leaves one
+        alone. Right, if any run knows it, the mean absolute deviation of the skills' Q-values from
+        their mean.
+
+    Raises:
+        ValueError: no runs, or a run without rows, without these metrics, or of one skill.
+    """
+    if not rows_by_run:
+        raise ValueError("no runs, expected at least one")
+    for run, rows in rows_by_run.items():
+        needed = ("episodes", "gate_entropy", "skill_usage")
+        if not rows or any(name not in row for row in rows for name in needed):
+            raise ValueError(f"run {run}: {len(rows)} rows, expected some, all with {needed}")
+        if np.shape(rows[0]["skill_usage"])[-1] < 2:
+            raise ValueError(f"run {run} has 1 skill, expected at least 2")
+    has_distance = any("skill_distance" in row for rows in rows_by_run.values() for row in rows)
+    names = ["entropy of the skill decision / log K"]
+    if has_distance:
+        names.append("distance between the skills' Q-values")
+    figure = Figure(figsize=(WIDTH_IN, 3.7), dpi=DPI, layout="constrained")
+    panels = figure.subplots(1, len(names), squeeze=False)[0]
+    for number, (run, rows) in enumerate(rows_by_run.items()):
+        colour = COLOURS[number % len(COLOURS)]
+        episodes = _metric(rows, "episodes").max(axis=1)
+        largest = math.log(np.shape(rows[0]["skill_usage"])[-1])
+        _draw_curve(panels[0], episodes, _metric(rows, "gate_entropy") / largest, colour, run)
+        if any("skill_distance" in row for row in rows):
+            _draw_curve(panels[1], episodes, _metric(rows, "skill_distance"), colour, run)
+    for axes, name in zip(panels, names, strict=True):
+        axes.set_title(name, fontsize=11)
+        axes.set_xlabel("training episodes")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        tidy(axes)
+    panels[0].set_ylim(-0.02, 1.05)
+    if has_distance:
+        panels[1].set_ylim(bottom=0)
+    handles, labels = panels[0].get_legend_handles_labels()
+    columns = min(len(labels), 4)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    figure.suptitle(title)
+    return figure

@@ -1,14 +1,23 @@
-"""The maps side by side."""
+"""The maps side by side, and what the robot sees in them."""
 
 from __future__ import annotations
 
+import string
 from collections.abc import Sequence
+from typing import Any
 
-from matplotlib.colors import ListedColormap
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from numpy.typing import NDArray
 
-from sqn_jax.figures.style import COLOURS, DPI, OBSTACLE, WIDTH_IN
+from sqn_jax.figures.ground import arrowhead, draw_map
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN
 from sqn_jax.maps import OccupancyMap
+from sqn_jax.recording import Episode
+
+MAX_SCANS = 6  # below each map of `observation_patterns`
 
 
 def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
@@ -23,20 +32,103 @@ def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, len(maps), squeeze=False)[0]
     for axes, occupancy_map in zip(panels, maps, strict=True):
-        width_m, height_m = occupancy_map.size_m
-        axes.imshow(
-            occupancy_map.occupied,
-            origin="lower",
-            extent=(0, width_m, 0, height_m),
-            cmap=ListedColormap(["#f7f7f4", OBSTACLE]),
-            interpolation="nearest",
-        )
-        for number, (x, y) in enumerate(occupancy_map.evaluation_points, start=1):
-            axes.plot(x, y, marker="o", ms=11, color=COLOURS[1], mec="white")
-            style = {"color": "white", "fontsize": 7, "fontweight": "bold"}
-            axes.annotate(str(number), (x, y), ha="center", va="center", **style)
-        axes.set_title(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m", fontsize=10)
-        axes.tick_params(labelsize=7)
-        axes.set_xlabel("x [m]", fontsize=8)
+        _draw_panel(axes, occupancy_map)
+        for number, place in enumerate(occupancy_map.evaluation_points, start=1):
+            _draw_place(axes, place, str(number), COLOURS[1])
     panels[0].set_ylabel("y [m]", fontsize=8)
     return figure
+
+
+def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
+    """A map with its name and its size."""
+    width_m, height_m = occupancy_map.size_m
+    draw_map(axes, occupancy_map)
+    axes.set_title(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m", fontsize=10)
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("x [m]", fontsize=8)
+
+
+def _draw_place(axes: Axes, place: NDArray[np.floating], name: str, colour: str) -> None:
+    """A dot at a place x m, y m with a short name in it."""
+    x, y = (float(value) for value in place)
+    axes.plot(x, y, marker="o", ms=11, color=colour, mec="white")
+    style: dict[str, Any] = {"color": "white", "fontsize": 7, "fontweight": "bold"}
+    axes.annotate(name, (x, y), ha="center", va="center", **style)
+
+
+def observation_patterns(
+    episodes: Sequence[Episode], *, scans: int = 4, title: str = "What the robot sees"
+) -> Figure:
+    """Draw the maps, and below each what its range beams see from a few places (paper, maps).
+
+    A pattern is the outline of a scan in the robot's own frame, straight ahead to the right, within
+    the circle of the sensor's reach. Its letter says where on the map it was taken. The places are
+    those of the way until the goal that are farthest from each other, the start first.
+
+    Args:
+        episodes: one for each map.
+        scans: patterns a map, 1..6.
+        title: stands above all panels.
+
+    Raises:
+        ValueError: there is no episode, or the number of scans is out of its range.
+    """
+    if not episodes:
+        raise ValueError("no episodes, expected at least one a map")
+    if not 1 <= scans <= MAX_SCANS:
+        raise ValueError(f"scans is {scans}, expected 1 to {MAX_SCANS}")
+    columns = 1 if scans == 1 else 2
+    lines = -(-scans // columns)
+    width = WIDTH_IN / len(episodes)
+    tallest = max(e.occupancy_map.size_m[1] / e.occupancy_map.size_m[0] for e in episodes)
+    heights = [min(width * tallest, 6.0) + 0.2, lines * min(width / columns, 2.2)]
+    size = (WIDTH_IN, sum(heights) + 0.8)
+    figure = Figure(figsize=size, dpi=DPI)
+    figure.set_layout_engine("constrained", w_pad=0.01, wspace=0.0)
+    grid = figure.add_gridspec(2, len(episodes), height_ratios=heights)
+    for column, episode in enumerate(episodes):
+        above = figure.add_subplot(grid[0, column])
+        _draw_panel(above, episode.occupancy_map)
+        above.locator_params(nbins=6, steps=[1, 2, 5, 10])
+        if column == 0:
+            above.set_ylabel("y [m]", fontsize=8)
+        # A narrow empty column keeps the patterns of neighbouring maps apart.
+        below = grid[1, column].subgridspec(lines, columns + 1, width_ratios=[1] * columns + [0.1])
+        for number, index in enumerate(spread_steps(episode, scans)):
+            letter = string.ascii_uppercase[number]
+            _draw_place(above, episode.poses[index, :2], letter, COLOURS[0])
+            _draw_pattern(
+                figure.add_subplot(below[divmod(number, columns)]), episode, index, letter
+            )
+    reach = f"{episodes[0].max_range:g} m"
+    figure.suptitle(title)
+    figure.supxlabel(
+        f"circle: {reach}, the sensor's reach; the robot looks to the right", fontsize=9
+    )
+    return figure
+
+
+def spread_steps(episode: Episode, count: int) -> list[int]:
+    """Moments in 0..T until the goal at places far apart: each the farthest from those before."""
+    places = episode.poses[: episode.time_steps + 1, :2]
+    chosen = [0]
+    nearest = np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < min(count, len(places)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return sorted(chosen)
+
+
+def _draw_pattern(axes: Axes, episode: Episode, index: int, letter: str) -> None:
+    """A scan in the robot's frame: x m ahead, to the right; y m to the robot's left, upwards."""
+    angles, reach = episode.beam_angles(), episode.ranges[index]
+    ends = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=-1)
+    outline = np.concatenate([ends, np.zeros((1, 2))])
+    axes.add_patch(Polygon(outline, fc=COLOURS[4], alpha=0.45, ec="none"))
+    axes.plot(*ends.T, ".", ms=2.2, color=COLOURS[0])
+    axes.add_patch(Circle((0.0, 0.0), episode.max_range, fill=False, ec="0.6", lw=0.8))
+    axes.add_patch(arrowhead((0.0, 0.0, 0.0), 0.2 * episode.max_range))
+    edge = 1.04 * episode.max_range
+    axes.set(aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
+    axes.axis("off")
+    axes.text(-edge, edge, letter, ha="left", va="top", fontsize=9, fontweight="bold", color=INK)

@@ -6,16 +6,16 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import colormaps, patheffects
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from numpy.typing import ArrayLike, NDArray
 
+from sqn_jax.figures.ground import RED, UNREACHABLE, YELLOW, draw_cross, draw_field
 from sqn_jax.figures.style import COLOURS, DPI, INK, OBSTACLE, WIDTH_IN
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
@@ -23,10 +23,6 @@ Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in one panel; more would hide each other
 
-_UNREACHABLE, _RED, _YELLOW = "#b9b9b9", "#b00020", "#ffd92f"
-_GROUND_MAP = ListedColormap([_UNREACHABLE, OBSTACLE])
-# Few and light shades, so that their steps read as height lines and paths stand out.
-_FIELD_MAP = ListedColormap(np.linspace([0.985, 0.99, 0.975], [0.70, 0.80, 0.82], 12))
 # Dark blue over violet to orange: brightness rises all along, so that it survives greyscale.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.8, 256)))
 
@@ -91,7 +87,7 @@ def trajectories(
     figure, grid = _panel_grid(occupancy_map, len(panels))
     norm = Normalize(0.0, float(fields[np.isfinite(fields)].max()))
     for axes, panel, field in zip(grid, panels, fields, strict=True):
-        image = _draw_field(axes, occupancy_map, field, norm)
+        image = draw_field(axes, occupancy_map, field, norm)
         for episode in _chosen_episodes(panel):
             end = int(steps[episode]) if success[episode] else length
             colours = weights[:end, episode, 0] if skills > 1 else None
@@ -185,16 +181,6 @@ def _panel_grid(occupancy_map: OccupancyMap, count: int) -> tuple[Figure, list[A
     return figure, grid[:count]
 
 
-def _draw_field(
-    axes: Axes, occupancy_map: OccupancyMap, field: NDArray[np.float32], norm: Normalize
-) -> AxesImage:
-    """Obstacles dark, places without a path to the goal grey, all others by their distance."""
-    width, height = occupancy_map.size_m
-    look: dict[str, Any] = {"origin": "lower", "extent": (0.0, width, 0.0, height)}
-    axes.imshow(occupancy_map.occupied, cmap=_GROUND_MAP, vmin=0, vmax=1, **look)
-    return axes.imshow(np.ma.masked_invalid(field), cmap=_FIELD_MAP, norm=norm, **look)
-
-
 def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bool) -> None:
     """One path [S + 1, 3] coloured by the weights [S] of its steps, with its start and its end."""
     points = poses[:, :2]
@@ -208,14 +194,13 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
     axes.add_collection(lines, autolim=False)
     axes.plot(*points[0], "o", ms=6, mfc="white", mec=INK, mew=1.3, zorder=5)
     if not reached:
-        cross = axes.plot(*points[-1], "x", ms=9, mec=_RED, mew=2.5, zorder=6)[0]
-        cross.set_path_effects([patheffects.withStroke(linewidth=4.5, foreground="white")])
+        draw_cross(axes, *points[-1])
 
 
 def _draw_goal(axes: Axes, panel: _Panel, steps: NDArray[Any], goal_radius: float) -> None:
     """The goal, and above the panel how many reached it, in how many steps on average."""
     axes.add_patch(Circle(panel.goal, goal_radius, fill=False, ec=INK, lw=1.2, zorder=4))
-    axes.plot(*panel.goal, "*", ms=11, mfc=_YELLOW, mec=INK, mew=1.0, zorder=7)
+    axes.plot(*panel.goal, "*", ms=11, mfc=YELLOW, mec=INK, mew=1.0, zorder=7)
     mean = f", {steps[panel.reached].mean():.0f} steps" if panel.reached.size else ""
     where = f"goal ({panel.goal[0]:.1f}, {panel.goal[1]:.1f}) m"
     axes.set_title(f"{where}: {panel.reached.size} of {panel.total} reached{mean}", fontsize=10)
@@ -223,14 +208,14 @@ def _draw_goal(axes: Axes, panel: _Panel, steps: NDArray[Any], goal_radius: floa
 
 def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> None:
     """What the marks mean, below the panels."""
-    marks = [("start", "o", 6, "white", INK), ("goal", "*", 11, _YELLOW, INK)]
+    marks = [("start", "o", 6, "white", INK), ("goal", "*", 11, YELLOW, INK)]
     marks.append((f"goal radius {goal_radius:g} m", "o", 10, "none", INK))
     if any_failure:
-        marks.append(("not reached", "x", 9, "none", _RED))
+        marks.append(("not reached", "x", 9, "none", RED))
     handles: list[Line2D | Patch] = [
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
         for label, marker, size, face, edge in marks
     ]
-    handles += [Patch(fc=OBSTACLE, label="obstacle"), Patch(fc=_UNREACHABLE, label="unreachable")]
+    handles += [Patch(fc=OBSTACLE, label="obstacle"), Patch(fc=UNREACHABLE, label="unreachable")]
     look: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
     figure.legend(handles=handles, loc="outside lower center", fontsize=9, **look)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,6 +26,30 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A picture that a notebook shows when it is the last line of a cell; needs no IPython."""
+
+    png: bytes = field(repr=False)
+    """The PNG file."""
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks ask an object for."""
+        return self.png
+
+
+def picture(figure: Figure) -> Picture:
+    """A figure as PNG in memory: the bytes that `save` would write."""
+    memory = io.BytesIO()
+    _write_png(figure, memory)
+    return Picture(memory.getvalue())
+
+
+def _write_png(figure: Figure, target: Path | BinaryIO) -> None:
+    # Without the software's version, the same figure gives the same file.
+    figure.savefig(target, format="png", dpi=DPI, metadata={"Software": None})
+
+
 def save(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG, all or nothing; missing folders are made.
 
@@ -35,8 +62,7 @@ def save(figure: Figure, path: str | Path) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Without the software's version, the same figure gives the same file.
-        figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
+        _write_png(figure, partial)
         partial.replace(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be written ({error.strerror})") from None

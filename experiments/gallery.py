@@ -1,0 +1,125 @@
+"""Draw the pictures of README and docs anew: python experiments/gallery.py [--only NAME ...]
+
+Maps and episodes are driven and drawn, by the policies that come with the package; learning curves
+and noise come from the records in experiments/results/. Everything goes to docs/images/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from experiments.common import run
+from sqn_jax import figures
+from sqn_jax.maps import load_map
+from sqn_jax.presets import PAPER_MAPS
+from sqn_jax.pretrained import find_policy, pretrained_names
+from sqn_jax.recording import Episode, record
+
+ROOT = Path(__file__).resolve().parents[1]
+OUT, RESULTS = ROOT / "docs" / "images", ROOT / "experiments" / "results"
+
+
+@cache
+def episodes(agent: str, map_name: str, count: int) -> tuple[Episode, ...]:
+    """The first episodes from the evaluation points, under the evaluation's first seed."""
+    return tuple(record(find_policy(f"pretrained:{agent}"), map_name, episodes=count))
+
+
+def maps() -> Any:
+    """The four maps with their evaluation points."""
+    return figures.map_gallery([load_map(name) for name in PAPER_MAPS])
+
+
+def observations() -> Any:
+    """What the robot sees on each map."""
+    return figures.observation_patterns([episodes("sqn", name, 1)[0] for name in PAPER_MAPS])
+
+
+def coverage() -> Any:
+    """The area seen during an episode."""
+    return figures.coverage_example(episodes("sqn", "maze", 8)[0])
+
+
+def reachability() -> Any:
+    """A goal that is near but hidden, and one that is reachable."""
+    return figures.reachability_example(episodes("sqn", "maze", 8))
+
+
+def timeline() -> Any:
+    """Skills, values and rewards along an episode."""
+    return figures.episode_timeline(episodes("sqn", "maze", 8)[0], title="SQN on the maze")
+
+
+def skills() -> Any:
+    """Which skill decides where, on every map."""
+    driven = [episode for name in PAPER_MAPS[:3] for episode in episodes("sqn", name, 8)[:6]]
+    return figures.skill_trajectories(
+        [*driven, episodes("sqn", "cave", 1)[0]], title="Weights of the two skills along the way"
+    )
+
+
+def agents() -> Any:
+    """The same tasks for every agent."""
+    driven = {name.upper(): episodes(name, "maze", 8)[:3] for name in pretrained_names()}
+    return figures.agents_side_by_side(driven, title="The same tasks on the maze")
+
+
+def learning_curve() -> Any:
+    """How the default preset learns, from the record of a run."""
+    rows = _recorded("pretrained_runs.json")["runs"][0]["curve"]
+    return figures.learning_curve(rows, title="SQN on maze")
+
+
+def learning_curves() -> Any:
+    """How three agents learn, from the record of the table's runs."""
+    found = _recorded("pretrained_runs.json")["runs"]
+    curves = {one["config"]["algo"].upper(): [one["curve"]] for one in found}
+    return figures.learning_curves(curves, title="Training on the maze")
+
+
+def robustness() -> Any:
+    """Success under noise, from the record of the robustness runs."""
+    results = _recorded("pretrained_noise.json")["results"]
+    kept = [entry for entry in results if entry["goal_radius"] == results[0]["goal_radius"]]
+    return figures.robustness(kept, title="Maze, evaluation points")
+
+
+STILLS: dict[str, Callable[[], Any]] = {
+    function.__name__: function
+    for function in (
+        *(maps, observations, coverage, reachability, timeline, skills, agents),
+        *(learning_curve, learning_curves, robustness),
+    )
+}
+FILMS = {"maze": 8, "cave": 1}
+"""Maps that a film is made of, and how many episodes are driven there."""
+
+
+def _recorded(name: str) -> Any:
+    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
+
+
+def main() -> None:
+    """Draw what is asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=[*STILLS, *FILMS], metavar="NAME")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder (default docs/images)")
+    options = parser.parse_args()
+    for name, draw in STILLS.items():
+        if not options.only or name in options.only:
+            figures.save(draw(), options.out / f"{name}.png")
+            print(f"wrote {options.out / name}.png", flush=True)
+    for name, count in FILMS.items():
+        if not options.only or name in options.only:
+            film = figures.gif(episodes("sqn", name, count)[0], count=160, width_px=720)
+            (options.out / f"{name}.gif").write_bytes(film)
+            print(f"wrote {options.out / name}.gif", flush=True)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,167 @@
+"""Which skill drove where: paths in the colours of the skill decision, agents side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sqn_jax.figures.ground import (
+    draw_field,
+    draw_map,
+    draw_skill_path,
+    path_legend,
+    scale_below,
+    skill_bar,
+)
+from sqn_jax.figures.style import DPI, WIDTH_IN
+from sqn_jax.maps import OccupancyMap, goal_distance, traversable
+from sqn_jax.recording import Episode
+
+MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit a page
+
+
+def skill_trajectories(episodes: Sequence[Episode], *, title: str) -> Figure:
+    """Draw paths over the map in the colours of the skill decision, a panel for each map.
+
+    With two skills the colour runs from vermillion (skill 2 alone) over grey to blue (skill 1
+    alone); with more a step has the colour of the skill of the largest weight; agents without
+    skills have one colour. A path ends where it first enters the goal radius; without success it is
+    drawn whole and ends in a cross.
+
+    Args:
+        episodes: of one map or several; all are drawn.
+        title: stands above all panels.
+
+    Raises:
+        ValueError: there is no episode.
+    """
+    if not episodes:
+        raise ValueError("no episodes, expected at least one")
+    groups: list[list[Episode]] = []
+    for episode in episodes:
+        own = [g for g in groups if _same_map(g[0].occupancy_map, episode.occupancy_map)]
+        own[0].append(episode) if own else groups.append([episode])
+    columns = math.ceil(len(groups) / math.ceil(len(groups) / 3))
+    figure, grid = _map_grid([group[0].occupancy_map for group in groups], columns, tallest=6.0)
+    for axes, group in zip(grid, groups, strict=True):
+        draw_map(axes, group[0].occupancy_map)
+        for episode in group:
+            draw_skill_path(axes, episode)
+        reached = sum(episode.success for episode in group)
+        name = group[0].occupancy_map.name
+        axes.set_title(f"{name}: {reached} of {len(group)} reached", fontsize=10)
+    _finish(figure, grid, episodes, title)
+    return figure
+
+
+def agents_side_by_side(
+    episodes_by_agent: Mapping[str, Sequence[Episode]], *, title: str
+) -> Figure:
+    """Draw the same tasks driven by several agents: a row for each task, a column for each agent.
+
+    The ground is the true distance to the goal; paths have the colours of `skill_trajectories`.
+
+    Args:
+        episodes_by_agent: for each agent its episodes, at most 4, all on one map; starts and goals
+            are the same for all agents, in the same order.
+        title: stands above all panels.
+
+    Raises:
+        ValueError: no agent, no episode or too many, or tasks that differ between agents.
+    """
+    _check_tasks(episodes_by_agent)
+    columns = list(episodes_by_agent.values())
+    tasks = list(zip(*columns, strict=True))
+    maps = [task[0].occupancy_map for task in tasks for _ in task]
+    figure, grid = _map_grid(maps, len(columns), tallest=3.0)
+    fields = _distance_fields(columns[0])
+    norm = Normalize(0.0, float(fields[np.isfinite(fields)].max()))
+    for row, (task, field) in enumerate(zip(tasks, fields, strict=True)):
+        for column, (agent, episode) in enumerate(zip(episodes_by_agent, task, strict=True)):
+            axes = grid[row * len(columns) + column]
+            image = draw_field(axes, episode.occupancy_map, field, norm)
+            draw_skill_path(axes, episode)
+            told = f"{episode.time_steps} steps" if episode.success else "not reached"
+            axes.set_title(f"{agent}: {told}", fontsize=10)
+    scale_below(figure, image, grid, "distance to the goal, m")
+    _finish(figure, grid, [episode for task in tasks for episode in task], title)
+    return figure
+
+
+def _check_tasks(episodes_by_agent: Mapping[str, Sequence[Episode]]) -> None:
+    """Refuse agents that were not given the same tasks."""
+    if not episodes_by_agent:
+        raise ValueError("no agents, expected at least one")
+    first, reference = next(iter(episodes_by_agent.items()))
+    for agent, episodes in episodes_by_agent.items():
+        if not 1 <= len(episodes) <= MAX_TASKS:
+            raise ValueError(
+                f"agent {agent} has {len(episodes)} episodes, expected 1 to {MAX_TASKS}"
+            )
+        if len(episodes) != len(reference):
+            raise ValueError(
+                f"agent {agent} has {len(episodes)} episodes, expected {len(reference)} as {first}"
+            )
+        for number, (ours, theirs) in enumerate(zip(episodes, reference, strict=True)):
+            same_start = np.allclose(ours.poses[0], theirs.poses[0], atol=1e-4)
+            same_goal = np.allclose(ours.goal, theirs.goal, atol=1e-4)
+            same_map = _same_map(ours.occupancy_map, reference[0].occupancy_map)
+            if not (same_map and same_start and same_goal):
+                raise ValueError(
+                    f"agent {agent}, episode {number}: another map, start or goal than {first}'s, "
+                    "expected the same tasks on one map"
+                )
+
+
+def _same_map(one: OccupancyMap, other: OccupancyMap) -> bool:
+    if one is other:
+        return True
+    return one.resolution == other.resolution and np.array_equal(one.occupied, other.occupied)
+
+
+def _distance_fields(tasks: Sequence[Episode]) -> NDArray[np.float32]:
+    """[tasks, H, W] m on the shortest way to each goal on their map, inf where there is none."""
+    occupancy_map = tasks[0].occupancy_map
+    free = traversable(occupancy_map.occupied, occupancy_map.resolution, tasks[0].robot_radius)
+    return goal_distance(free, occupancy_map.resolution, [task.goal for task in tasks])
+
+
+def _map_grid(
+    maps: Sequence[OccupancyMap], columns: int, *, tallest: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each map, fitted to their shapes but at most `tallest` inches."""
+    lines = math.ceil(len(maps) / columns)
+    shape = max(one.size_m[1] / one.size_m[0] for one in maps)
+    panel_height = min(((WIDTH_IN - 0.3) / columns - 0.35) * shape, tallest)
+    size = (WIDTH_IN, lines * (panel_height + 0.35) + 2.1)
+    figure = Figure(figsize=size, dpi=DPI, layout="compressed")
+    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes in grid[len(maps) :]:
+        axes.remove()
+    for number, (axes, occupancy_map) in enumerate(zip(grid, maps, strict=False)):
+        width, height = occupancy_map.size_m
+        axes.set(aspect="equal", xlim=(0, width), ylim=(0, height))
+        axes.set_xlabel("x, m" if number + columns >= len(maps) else "")
+        axes.set_ylabel("y, m" if number % columns == 0 else "")
+        axes.locator_params(nbins=6, steps=[1, 2, 5, 10])
+        axes.tick_params(labelsize=8)
+    return figure, grid[: len(maps)]
+
+
+def _finish(figure: Figure, grid: Sequence[Axes], episodes: Sequence[Episode], title: str) -> None:
+    """The scale of the skills where there are two, the legend, the title, and a settled layout."""
+    if any(episode.skill_weights.shape[1] == 2 for episode in episodes):
+        skill_bar(figure, grid)
+    handles = path_legend(episodes)
+    look: dict[str, Any] = {"loc": "outside lower center", "ncols": min(len(handles), 5)}
+    figure.legend(handles=handles, frameon=False, fontsize=9, **look)
+    figure.suptitle(title)
+    # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
+    figure.draw_without_rendering()

@@ -1,0 +1,124 @@
+"""One episode in numbers over time: skill decision, Q-values, rewards, distance to the goal."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sqn_jax.figures.ground import mark_arrival, skill_colour
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, tidy
+from sqn_jax.recording import Episode
+
+_REWARD_PARTS = ("navigation", "exploration", "time")
+_PART_STYLES = ((COLOURS[2], "-"), (COLOURS[5], "--"), ("#7a7a7a", "-."))
+_OF_STEPS = (
+    *("actions", "rewards", "reward_parts", "goal_distances", "reachable", "collisions"),
+    *("covered_areas", "skill_weights", "skill_q_values", "q_values"),
+)
+
+
+def episode_timeline(episode: Episode, *, title: str) -> Figure:
+    """Draw an episode over time: skill weights, Q-values, rewards and the distance to the goal.
+
+    The panels from above: the skill decision, stacked (left out for an agent without skills); the
+    value of the best action of each skill and of their weighted sum; the running sums of the
+    weighted parts of the reward; the distance to the goal in a straight line, shaded while the goal
+    was reachable (paper eq. 7), with a tick for each refused move. A dotted line in all panels is
+    the moment of arrival; the time axis goes on for a quarter of the way after it.
+
+    Args:
+        episode: what is drawn.
+        title: stands above all panels, with the outcome below it.
+    """
+    episode = _first_steps(episode, math.ceil(1.25 * episode.time_steps))
+    skills = episode.skill_weights.shape[1]
+    count = 4 if skills > 1 else 3
+    size = (WIDTH_IN, 1.75 * count + 0.9)
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    panels = list(figure.subplots(count, 1, sharex=True))
+    if skills > 1:
+        _draw_weights(panels[0], episode)
+    _draw_values(panels[-3], episode)
+    _draw_rewards(panels[-2], episode)
+    _draw_distance(panels[-1], episode)
+    for axes in panels:
+        tidy(axes)
+        if episode.success:
+            mark_arrival(axes, episode)
+        axes.set_xlim(0, episode.num_steps * episode.time_step)
+        axes.yaxis.label.set_fontsize(9.5)
+        axes.legend(loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)
+    panels[-1].set_xlabel("time, s")
+    figure.align_ylabels(panels)
+    seconds = episode.time_steps * episode.time_step
+    outcome = f"{episode.time_steps} steps, {seconds:.1f} s"
+    word = "reached after" if episode.success else "not reached in"
+    figure.suptitle(f"{title}\ngoal {word} {outcome}", fontsize=12)
+    return figure
+
+
+def _first_steps(episode: Episode, steps: int) -> Episode:
+    """The beginning of an episode, at most all of it; what was covered and seen stays whole."""
+    first: dict[str, Any] = {name: getattr(episode, name)[:steps] for name in _OF_STEPS}
+    return dataclasses.replace(episode, poses=episode.poses[: steps + 1], **first)
+
+
+def _draw_weights(axes: Axes, episode: Episode) -> None:
+    """The weights [T, K] stacked from skill 1 at the bottom; each holds for its step."""
+    edges = np.arange(episode.num_steps + 1) * episode.time_step
+    weights = np.concatenate([episode.skill_weights, episode.skill_weights[-1:]])
+    tops = np.cumsum(weights, axis=1)
+    for skill in range(weights.shape[1]):
+        low, high = tops[:, skill] - weights[:, skill], tops[:, skill]
+        look: dict[str, Any] = {"color": skill_colour(skill), "label": f"skill {skill + 1}"}
+        axes.fill_between(edges, low, high, step="post", alpha=0.8, lw=0, **look)
+    axes.set(ylim=(0, 1), ylabel="skill weight", axisbelow=True)
+
+
+def _draw_values(axes: Axes, episode: Episode) -> None:
+    """The value of the best action, of each skill and of the ensemble."""
+    times = np.arange(episode.num_steps) * episode.time_step
+    best = episode.skill_q_values.max(axis=2)
+    if best.shape[1] > 1:
+        for skill, values in enumerate(best.T):
+            axes.plot(times, values, color=skill_colour(skill), lw=1.3, label=f"skill {skill + 1}")
+    name = "ensemble" if best.shape[1] > 1 else "Q-value"
+    axes.plot(times, episode.q_values.max(axis=1), color=INK, lw=1.3, label=name)
+    axes.set_ylabel("Q-value,\nbest action")
+
+
+def _draw_rewards(axes: Axes, episode: Episode) -> None:
+    """The running sums of the weighted parts of the reward, and of the reward."""
+    times = np.arange(episode.num_steps + 1) * episode.time_step
+    sums = np.cumsum(np.concatenate([np.zeros((1, 3)), episode.reward_parts]), axis=0)
+    for values, name, (colour, style) in zip(sums.T, _REWARD_PARTS, _PART_STYLES, strict=True):
+        axes.plot(times, values, color=colour, ls=style, lw=1.8, label=name)
+    axes.plot(times, sums.sum(axis=1), color=INK, lw=1.2, label="reward")
+    axes.set_ylabel("reward\nup to here")
+
+
+def _draw_distance(axes: Axes, episode: Episode) -> None:
+    """The distance [T + 1] m to the goal, when it was reachable, and the refused moves."""
+    times = np.arange(episode.num_steps + 1) * episode.time_step
+    first = np.linalg.norm(episode.poses[0, :2] - episode.goal)
+    distances = np.concatenate([[first], episode.goal_distances])
+    high = 1.08 * float(distances.max())
+    if episode.reachable.any():
+        # What is known after a step holds until after the next.
+        shade = np.where(np.concatenate([[False], episode.reachable]), high, 0.0)
+        look: dict[str, Any] = {"step": "post", "color": COLOURS[2], "alpha": 0.25, "lw": 0}
+        axes.fill_between(times, 0, shade, label="goal reachable", **look)
+    axes.plot(times, distances, color=COLOURS[0], lw=1.8, label="distance")
+    axes.axhline(episode.goal_radius, color="0.45", lw=0.9, ls="--", label="goal radius")
+    if episode.collisions.any():
+        refused = times[1:][episode.collisions]
+        bottom = np.full(refused.shape, 0.03 * high)
+        axes.plot(refused, bottom, "|", color=COLOURS[1], ms=9, mew=1.3, label="move refused")
+    if episode.success:
+        axes.plot([], [], color=INK, ls=":", lw=1.4, label="goal radius entered")
+    axes.set(ylim=(0, high), ylabel="to the goal, m")

@@ -1,0 +1,184 @@
+"""What a report says: the runs as they were found, and what they do when they are driven."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sqn_jax import config as configs
+from sqn_jax.compare import (
+    Agent,
+    Driven,
+    Learnt,
+    Settings,
+    World,
+    evaluate_agents,
+    group_policies,
+    load_maps,
+    num_episodes,
+    with_references,
+)
+from sqn_jax.config import TrainConfig
+from sqn_jax.policies import Policy
+from sqn_jax.presets import PRESETS
+from sqn_jax.pretrained import PREFIX, find_policy
+from sqn_jax.report.episodes import Drive, Hard, hardest
+from sqn_jax.runlog import RunFolder
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder, or a policy that comes with the package."""
+
+    name: str
+    policy: Policy
+    metrics: list[dict[str, Any]]
+    """The rows of its metrics.jsonl; none for a policy that comes with the package."""
+    summary: dict[str, Any]
+    """Its summary.json; empty where there is none."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that a page tells."""
+
+    runs: list[Run]
+    agents: list[Learnt]
+    """The runs; those that differ in nothing but their seeds are one agent."""
+    settings: Settings
+    evaluation: dict[str, Any]
+    """As `compare.evaluate_agents` returns it, the references among it."""
+    drives: list[Drive]
+    """The episodes of the agents, without those of the references."""
+    hardest: list[Hard]
+    """Three at most."""
+
+
+def read_runs(words: Sequence[str]) -> list[Run]:
+    """Runs by the names a user gives: folders, or `pretrained:NAME`.
+
+    Folders of the same name in different places are called as the user does.
+
+    Raises:
+        ValueError: one is not there, or damaged.
+    """
+    runs = [_read_run(word) for word in words]
+    times = Counter(run.name for run in runs)
+    return [
+        replace(run, name=word) if times[run.name] > 1 else run
+        for word, run in zip(words, runs, strict=True)
+    ]
+
+
+def _read_run(word: str) -> Run:
+    policy = find_policy(word)
+    if word.startswith(PREFIX):
+        return Run(word, policy, [], {})
+    folder, _ = RunFolder.open(Path(word))
+    return Run(policy.name, policy, folder.read_metrics(), _summary(folder.path))
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """A run that was stopped has none."""
+    path = folder / "summary.json"
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read ({error})") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: holds {type(found).__name__}, expected an object")
+    return found
+
+
+def gather(runs: Sequence[Run], settings: Settings, *, references: bool) -> Content:
+    """Drive the runs under a progress bar.
+
+    Raises:
+        ValueError: a map is unusable for a robot, or runs cannot be told apart.
+    """
+    learnt = group_policies([run.policy for run in runs])
+    for name, times in Counter(agent.name for agent in learnt).items():
+        if times > 1:
+            raise ValueError(f"{times} runs are called {name!r}, expected different names")
+    agents = with_references(learnt, references=references)
+    maps = load_maps(agents, settings)
+    drives: list[Drive] = []
+
+    def keep(agent: Agent, world: World, index: int, driven: Driven) -> None:
+        if isinstance(agent, Learnt):
+            drives.append(_drive(agent, world, index, driven, drives, settings))
+
+    with tqdm(
+        total=num_episodes(agents, settings),
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        dynamic_ncols=True,
+        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
+        "[{elapsed}, {remaining} left]",
+    ) as bar:
+        evaluation, _ = evaluate_agents(agents, maps, settings, bar.update, keep)
+    print("looking at what went worst, and drawing it ...", flush=True)
+    return Content(list(runs), learnt, settings, evaluation, drives, hardest(drives))
+
+
+def _drive(
+    agent: Learnt,
+    world: World,
+    index: int,
+    driven: Driven,
+    before: Sequence[Drive],
+    settings: Settings,
+) -> Drive:
+    """What is kept of the episodes just driven: evaluation seeds come one after the other."""
+    (summary, *_), trace = driven
+    earlier = sum(
+        (drive.agent is agent and drive.world is world and drive.index == index) for drive in before
+    )
+    return Drive(
+        agent=agent,
+        world=world,
+        index=index,
+        eval_seed=settings.seed + earlier,
+        summary=summary,
+        poses=np.asarray(trace.poses),
+        goals=np.asarray(trace.goals),
+        collisions=np.asarray(trace.collisions),
+        skill_weights=np.asarray(trace.skill_weights),
+    )
+
+
+def flat_config(config: TrainConfig) -> dict[str, Any]:
+    """Every setting by its name, `learner.discount` for one of a group."""
+    flat: dict[str, Any] = {}
+    for name, value in configs.to_dict(config).items():
+        if isinstance(value, dict):
+            flat |= {f"{name}.{inner}": each for inner, each in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def changed_settings(config: TrainConfig) -> tuple[str, list[tuple[str, Any, Any]]]:
+    """The preset that a config is nearest to, and where it differs.
+
+    Returns:
+        Name of the preset; name, value and the preset's value of each setting that differs.
+    """
+    ours = flat_config(config)
+    changes = {}
+    for preset, defaults in PRESETS.items():
+        theirs = flat_config(defaults)
+        changes[preset] = [
+            (name, ours[name], theirs[name]) for name in ours if ours[name] != theirs[name]
+        ]
+    nearest = min(changes, key=lambda preset: len(changes[preset]))
+    return nearest, changes[nearest]

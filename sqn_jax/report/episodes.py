@@ -1,0 +1,169 @@
+"""The episodes that went worst, and the places where they did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sqn_jax.compare import Learnt, World, shortest_ways
+from sqn_jax.rollout import EpisodeSummary
+
+Floats = NDArray[np.floating]
+
+NEAR = 1.0
+"""m; how far around a place a robot counts as being there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """E episodes of one policy in one world under one evaluation seed, T steps each."""
+
+    agent: Learnt
+    world: World
+    index: int
+    """Which of the agent's training seeds."""
+    eval_seed: int
+    summary: EpisodeSummary
+    """NumPy arrays [E]."""
+    poses: Floats
+    """[T + 1, E, 3] x m, y m, heading rad."""
+    goals: Floats
+    """[E, 2] x m, y m."""
+    collisions: NDArray[np.bool_]
+    """[T, E] the move was refused."""
+    skill_weights: Floats
+    """[T, E, K]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a robot was most of the time."""
+
+    x: float
+    """m."""
+    y: float
+    """m."""
+    steps: int
+    """Steps that ended within `NEAR` of it."""
+    of: int
+    """The steps that were looked at, the last ones of the episode."""
+
+    @property
+    def is_most(self) -> bool:
+        """Whether the robot was there at least half of the time."""
+        return 2 * self.steps >= self.of
+
+
+@dataclass(frozen=True, eq=False)
+class Hard:
+    """One episode that went badly."""
+
+    drive: Drive
+    episode: int
+    """Which of the drive's."""
+    way: float
+    """m, the shortest way from start to goal."""
+    left: float
+    """m, the shortest way from where the robot ended to the goal; 0 for a success."""
+    place: Place
+    """Of a failure in the last half of the episode, of a success up to its goal."""
+
+    @property
+    def success(self) -> bool:
+        return bool(self.drive.summary.success[self.episode])
+
+    @property
+    def steps(self) -> int:
+        """Steps until the goal was reached; the whole episode for a failure."""
+        return int(self.drive.summary.time_steps[self.episode])
+
+    @property
+    def refused(self) -> int:
+        """Moves refused within these steps."""
+        return int(self.drive.collisions[: self.steps, self.episode].sum())
+
+    @property
+    def slowness(self) -> float:
+        """Steps, as a multiple of those that the shortest way takes at full speed."""
+        return self.steps / _fewest_steps(self.drive, self.way)
+
+
+def densest_place(points: Floats) -> Place:
+    """The point with most points within `NEAR` of it; among equals the one they are nearest to.
+
+    Args:
+        points: [N, 2] x m, y m, at least one.
+    """
+    best = (0, 0.0)
+    densest = points[0]
+    # A robot that stands still has many points and one place.
+    for point in np.unique(points, axis=0):
+        away = np.hypot(*(points - point).T)
+        near = away[away <= NEAR]
+        rank = (near.size, -float(near.sum()))
+        if rank > best:
+            best, densest = rank, point
+    return Place(float(densest[0]), float(densest[1]), best[0], len(points))
+
+
+def hardest(drives: Sequence[Drive], count: int = 3) -> list[Hard]:
+    """The episodes that went worst, the worst first.
+
+    Failures come before successes: those with the longest way left over the map first. If they are
+    too few, the successes that were slowest beside their shortest way follow.
+
+    Args:
+        drives: all that was driven.
+        count: at most so many.
+    """
+    found: list[Hard] = []
+    for success in (False, True):
+        if len(found) < count:
+            ranked = _ranked(drives, success=success)
+            found += [_looked_at(*each) for each in ranked[: count - len(found)]]
+    return found
+
+
+def _ranked(drives: Sequence[Drive], *, success: bool) -> list[tuple[Drive, int]]:
+    """All failures or all successes, from the worst to the best."""
+    ranks: list[tuple[float, int, int]] = []
+    numbered = list(enumerate(drives))
+    for world in {id(drive.world): drive.world for drive in drives}.values():
+        # Together, since agents have goals in common and a distance field takes its time.
+        same = [(number, drive) for number, drive in numbered if drive.world is world]
+        chosen = [
+            (number, episode)
+            for number, drive in same
+            for episode in np.flatnonzero(np.asarray(drive.summary.success) == success)
+        ]
+        if not chosen:
+            continue
+        moment = 0 if success else -1
+        places = np.stack([drives[number].poses[moment, episode] for number, episode in chosen])
+        goals = np.stack([drives[number].goals[episode] for number, episode in chosen])
+        for (number, episode), way in zip(chosen, shortest_ways(world, places, goals), strict=True):
+            drive = drives[number]
+            steps = float(drive.summary.time_steps[episode])
+            badness = steps / _fewest_steps(drive, way) if success else float(way)
+            ranks.append((-badness, number, int(episode)))
+    return [(drives[number], episode) for _, number, episode in sorted(ranks)]
+
+
+def _looked_at(drive: Drive, episode: int) -> Hard:
+    success = bool(drive.summary.success[episode])
+    steps = int(drive.summary.time_steps[episode])
+    first = 0 if success else steps // 2
+    ends = drive.poses[[0, -1], episode]
+    goals = drive.goals[[episode, episode]]
+    way, left = (float(length) for length in shortest_ways(drive.world, ends, goals))
+    place = densest_place(drive.poses[first + 1 : steps + 1, episode, :2])
+    return Hard(drive, episode, way, 0.0 if success else left, place)
+
+
+def _fewest_steps(drive: Drive, way: float) -> float:
+    """Steps that a way takes at full speed; at least one."""
+    config = drive.world.env_params.config
+    return max(1.0, way / (config.forward_speed * config.time_step))

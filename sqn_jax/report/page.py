@@ -1,0 +1,353 @@
+"""The page: semantic HTML with its style and pictures inside, and nothing that it would fetch."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sqn_jax import config as configs
+from sqn_jax.compare import Settings
+from sqn_jax.paper import PAPER_RESULTS
+from sqn_jax.presets import PAPER_MAPS
+from sqn_jax.report.content import Content, Run, changed_settings
+from sqn_jax.report.episodes import NEAR, Hard
+from sqn_jax.report.pictures import Picture, Pictures, policy_words
+from sqn_jax.runlog import CONFIG, probe_writable
+
+_REFERENCES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
+  max-width: 54rem; margin: 0 auto; padding: 1rem; overflow-wrap: break-word; }
+h1, h2, h3 { line-height: 1.25; margin: 2rem 0 .6rem; }
+h1 { font-size: 1.7rem; margin-top: .5rem; }
+h2 { font-size: 1.3rem; border-bottom: 2px solid #0072b2; padding-bottom: .2rem; }
+h3 { font-size: 1.05rem; }
+p { margin: .6rem 0; }
+.lead { font-size: 1.1rem; }
+figure { margin: 1rem 0 1.5rem; }
+img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
+figcaption, .note { color: #555; font-size: .9rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right;
+  white-space: nowrap; }
+thead th { border-bottom: 2px solid #999; vertical-align: bottom; }
+th[scope=colgroup] { text-align: center; border-bottom-width: 1px; }
+th[scope=row] { position: sticky; left: 0; background: #fff; }
+th[scope=row], .settings th, .settings td { text-align: left; }
+tr.reference th, tr.reference td { color: #555; font-weight: normal; }
+tr.first th, tr.first td { border-top: 2px solid #999; }
+pre { overflow-x: auto; background: #f5f5f5; padding: .7rem; font-size: .8rem; }
+summary { cursor: pointer; margin: .6rem 0; }
+@media print {
+  body { max-width: none; padding: 0; font-size: 10pt; }
+  figure, table, .hard { break-inside: avoid; }
+  h2, h3 { break-after: avoid; }
+  img { max-height: 17cm; }
+  .hard img { max-height: 12cm; }
+  .scroll { overflow: visible; }
+}
+"""
+
+
+def require_writable(path: Path) -> None:
+    """Refuse a file that could not be written, before anything is driven.
+
+    Raises:
+        ValueError: the name does not end in .html, or there is no place for such a file.
+    """
+    if path.suffix != ".html":
+        raise ValueError(f"--out is {path}, expected a file ending in .html")
+    if not path.parent.is_dir() or path.is_dir():
+        raise ValueError(f"--out {path}: expected a file in an existing folder")
+    try:
+        probe_writable(path.parent)
+    except OSError as error:
+        raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
+
+
+def write(path: Path, html: str) -> None:
+    """Write a page as a whole or not at all.
+
+    Raises:
+        ValueError: it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        # A folder's name need not be text; what is none becomes a question mark.
+        partial.write_text(html, encoding="utf-8", errors="replace", newline="\n")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def to_html(content: Content, pictures: Pictures) -> str:
+    """The page as text; the same content and pictures give the same text."""
+    title = f"Report on {', '.join(run.name for run in content.runs)}"
+    sections = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">{escape(lead(content))}</p>',
+        f'<p class="note">{escape(_how(content.settings))}</p>',
+        *_hardest(content.hardest, pictures.hardest),
+        "<h2>Success and time steps</h2>",
+        results_table(content.evaluation["results"], content.settings),
+        *_training(content, pictures),
+        "<h2>Paths</h2>",
+        *map(_figure, pictures.paths),
+        *_left_out(pictures),
+        "<h2>One episode</h2>",
+        _figure(pictures.animation),
+        "<h2>Settings</h2>",
+        *(part for run in content.runs for part in _settings(run)),
+    ]
+    return "\n".join(
+        [
+            "<!DOCTYPE html>",
+            '<html lang="en">',
+            "<head>",
+            '<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            # Should anything get past the escaping, it can neither run nor fetch.
+            '<meta http-equiv="Content-Security-Policy" '
+            "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">",
+            f"<title>{escape(title)}</title>",
+            f"<style>{_STYLE}</style>",
+            "</head>",
+            "<body>",
+            "<main>",
+            *sections,
+            "</main>",
+            "</body>",
+            "</html>",
+            "",
+        ]
+    )
+
+
+def lead(content: Content) -> str:
+    """One sentence of what it came to."""
+    parts = []
+    for agent in content.agents:
+        told = [
+            f"{entry['success']['mean']:.2f} on {_world(entry, content.settings)} "
+            f"({entry['time_steps']['mean']:,.0f} steps)"
+            for entry in content.evaluation["results"]
+            if entry["agent"] == agent.name
+        ]
+        parts.append(f"{agent.name} has success {_listed(told)}")
+    return "; ".join(parts) + "."
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _world(entry: dict[str, Any], settings: Settings) -> str:
+    """The map, and the tasks too where there are two kinds of them."""
+    name = str(entry["map"])
+    return name if len(settings.tasks) == 1 else f"{name}, {entry['tasks']}"
+
+
+def _how(settings: Settings) -> str:
+    seeds = f"evaluation seed {settings.seed}"
+    if settings.eval_seeds > 1:
+        last = settings.seed + settings.eval_seeds - 1
+        seeds = f"each of the evaluation seeds {settings.seed} to {last}"
+    tasks = {
+        "evaluation points": "between the evaluation points of the map",
+        "random pairs": "between random pairs of spawn points",
+    }
+    return (
+        f"{settings.episodes:,} greedy episodes of each trained seed under {seeds}, "
+        f"{' and '.join(tasks[word] for word in settings.tasks)}; the goal counts as reached "
+        f"within {settings.goal_radii[0]:g} m of it, and a failure counts as many time steps as "
+        "an episode has."
+    )
+
+
+def _hardest(hardest: Sequence[Hard], pictures: Sequence[Picture]) -> Iterable[str]:
+    failures = sum(not hard.success for hard in hardest)
+    yield "<h2>What went worst</h2>"
+    if failures == len(hardest):
+        rule = "The failures that ended with the longest way left to the goal."
+    elif failures:
+        rule = "All failures, and the successes that were slowest beside their shortest way."
+    else:
+        rule = "No episode failed: the successes that were slowest beside their shortest way."
+    yield f'<p class="note">{rule}</p>'
+    for number, (hard, picture) in enumerate(zip(hardest, pictures, strict=True), start=1):
+        heading = f"{number}. {hard.drive.world.occupancy_map.name}: {_in_short(hard)}"
+        yield '<section class="hard">'
+        yield f"<h3>{escape(heading)}</h3>"
+        yield f"<p>{escape(words(hard))}</p>"
+        yield _figure(picture)
+        yield "</section>"
+
+
+def _in_short(hard: Hard) -> str:
+    if hard.success:
+        return f"reached, in {hard.slowness:.1f} times the steps of the shortest way"
+    return f"{_metres(hard.left)} of way left"
+
+
+def _metres(length: float) -> str:
+    return f"{length:.1f} m" if np.isfinite(length) else "no end"
+
+
+def words(hard: Hard) -> str:
+    """What happened in an episode, with numbers."""
+    drive, place = hard.drive, hard.place
+    start, goal = drive.poses[0, hard.episode], drive.goals[hard.episode]
+    there = f"within {NEAR:g} m of ({place.x:.1f}, {place.y:.1f}) m"
+    share = f"{place.steps:,} of the last {place.of:,} steps"
+    if hard.success:
+        end = (
+            f"The goal was reached after {hard.steps:,} steps, {hard.slowness:.1f} times as many "
+            f"as the shortest way of {_metres(hard.way)} takes at full speed. Of these steps "
+            f"{place.steps:,} were spent {there}."
+        )
+    else:
+        stuck = f"The robot got stuck: it spent {share} {there}."
+        if not place.is_most:
+            stuck = f"The robot got stuck nowhere for long: at most it spent {share} {there}."
+        end = (
+            f"The goal was not reached within {hard.steps:,} steps. {stuck} {_metres(hard.left)} "
+            f"of way were left, of {_metres(hard.way)} from the start."
+        )
+    moves = {0: "No move was", 1: "1 move was"}.get(hard.refused, f"{hard.refused:,} moves were")
+    return (
+        f"{drive.agent.name}, {policy_words(drive)}, on {drive.world.occupancy_map.name} "
+        f"({drive.world.tasks}, episode {hard.episode} of evaluation seed {drive.eval_seed}): "
+        f"from ({start[0]:.1f}, {start[1]:.1f}) m to the goal at ({goal[0]:.1f}, {goal[1]:.1f}) m. "
+        f"{end} {moves} refused."
+    )
+
+
+def results_table(results: Sequence[dict[str, Any]], settings: Settings) -> str:
+    """Success and time steps: agents, references and the paper below each other, maps across."""
+    worlds = list(dict.fromkeys((entry["map"], entry["tasks"]) for entry in results))
+    agents = {entry["agent"]: entry["algorithm"] for entry in results}
+    found = {(entry["agent"], entry["map"], entry["tasks"]): entry for entry in results}
+    rows = []
+    for agent, algorithm in agents.items():
+        cells = [_cells(found.get((agent, *world))) for world in worlds]
+        name = _REFERENCES.get(algorithm, agent)
+        rows.append(_row(name, cells, "reference" if algorithm in _REFERENCES else ""))
+    look = "reference first"
+    for algorithm in dict.fromkeys(agents.values()):
+        cells = [_paper_cells(algorithm, world, settings) for world in worlds]
+        if any(any(pair) for pair in cells):
+            rows.append(_row(f"the paper, {algorithm.upper()}", cells, look))
+            look = "reference"
+    names = [_world({"map": name, "tasks": tasks}, settings) for name, tasks in worlds]
+    above = "".join(f'<th colspan="2" scope="colgroup">{escape(name)}</th>' for name in names)
+    below = '<th scope="col">success</th><th scope="col">steps</th>' * len(names)
+    note = "In brackets a 95 % interval over episodes; training seeds may differ by more."
+    if look == "reference":
+        note += " The paper's numbers are on maps of its own, which are not published."
+    return "\n".join(
+        [
+            '<div class="scroll"><table class="results">',
+            f'<thead><tr><th rowspan="2" scope="col"></th>{above}</tr><tr>{below}</tr></thead>',
+            "<tbody>",
+            *rows,
+            "</tbody></table></div>",
+            f'<p class="note">{note}</p>',
+        ]
+    )
+
+
+def _cells(entry: dict[str, Any] | None) -> tuple[str, str]:
+    if entry is None:
+        return "", ""
+    low, high = entry["success"]["ci95"]
+    success = f"{entry['success']['mean']:.2f} [{low:.2f}, {high:.2f}]"
+    return success, f"{entry['time_steps']['mean']:,.1f}"
+
+
+def _paper_cells(algorithm: str, world: tuple[str, str], settings: Settings) -> tuple[str, str]:
+    """The paper's numbers for one of its maps; a user's file may have the same name."""
+    name, tasks = world
+    results = PAPER_RESULTS.get(algorithm, {})
+    known = name in PAPER_MAPS and name in settings.maps and tasks == "evaluation points"
+    if not known or name not in results:
+        return "", ""
+    success, steps = results[name]
+    return f"{success:.2f}", f"{steps:,.1f}"
+
+
+def _row(name: str, cells: Sequence[tuple[str, str]], look: str) -> str:
+    told = "".join(f"<td>{escape(cell)}</td>" for pair in cells for cell in pair)
+    return f'<tr class="{look}"><th scope="row">{escape(name)}</th>{told}</tr>'
+
+
+def _training(content: Content, pictures: Pictures) -> Iterable[str]:
+    if pictures.curves:
+        yield "<h2>Training</h2>"
+        yield from map(_figure, pictures.curves)
+
+
+def _left_out(pictures: Pictures) -> Iterable[str]:
+    if pictures.paths_left_out:
+        yield f'<p class="note">{pictures.paths_left_out} more pictures are left out.</p>'
+
+
+def _figure(picture: Picture) -> str:
+    kind = "gif" if picture.data.startswith(b"GIF8") else "png"
+    data = base64.b64encode(picture.data).decode("ascii")
+    return (
+        f'<figure><img src="data:image/{kind};base64,{data}" alt="{escape(picture.text)}">'
+        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
+    )
+
+
+def _settings(run: Run) -> Iterable[str]:
+    """What differs from the nearest preset, then everything; on what it was trained."""
+    config = run.policy.config
+    preset, changes = changed_settings(config)
+    yield f"<h3>{escape(run.name)}</h3>"
+    yield f"<p>{escape(_provenance(run))}</p>"
+    if changes:
+        rows = "".join(
+            f'<tr><th scope="row"><code>{escape(name)}</code></th>'
+            f"<td>{escape(str(ours))}</td><td>{escape(str(theirs))}</td></tr>"
+            for name, ours, theirs in changes
+        )
+        yield (
+            '<div class="scroll"><table class="settings"><thead><tr><th scope="col">setting</th>'
+            f'<th scope="col">this run</th><th scope="col">preset {escape(preset)}</th></tr>'
+            f"</thead><tbody>{rows}</tbody></table></div>"
+        )
+    else:
+        yield f"<p>Every setting is that of the preset {escape(preset)}.</p>"
+    whole = json.dumps(configs.to_dict(config), indent=2)
+    yield (
+        f"<details><summary>All settings ({CONFIG})</summary><pre>{escape(whole)}</pre></details>"
+    )
+
+
+def _provenance(run: Run) -> str:
+    """Device and versions from the run's own summary."""
+    summary = run.summary
+    parts = []
+    if "device" in summary:
+        times = summary.get("num_devices", 1)
+        parts.append(f"device {summary['device']}" + (f" x {times}" if times != 1 else ""))
+    versions = summary.get("versions")
+    if isinstance(versions, dict):
+        parts += [f"{name} {version}" for name, version in versions.items()]
+    if isinstance(summary.get("wall_seconds"), int | float):
+        parts.append(f"{summary['wall_seconds'] / 60:,.1f} minutes of training")
+    if not parts:
+        return "Device and versions of the training are not recorded."
+    return f"Trained with {', '.join(parts)}."

@@ -1,0 +1,229 @@
+"""The pictures of a report, as bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sqn_jax import figures
+from sqn_jax.compare import Learnt, task_key
+from sqn_jax.evaluate import episode_keys
+from sqn_jax.figures.animation import gif
+from sqn_jax.recording import Episode, on_host, record_episodes
+from sqn_jax.report.content import Content, Run
+from sqn_jax.report.episodes import NEAR, Drive, Hard, Place
+
+MOST_BYTES = 7_000_000
+"""Of all pictures of a page, which is a third larger; pictures of paths beyond it are left out."""
+
+_FRAMES, _FRAME_WIDTH_PX = 100, 560
+_INK, _PAPER = "#222222", "white"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG or GIF file, and what it shows."""
+
+    data: bytes
+    text: str
+    """In place of the picture, for those who cannot see it."""
+    caption: str
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """All pictures of a page."""
+
+    hardest: list[Picture]
+    """One for each of `Content.hardest`."""
+    curves: list[Picture]
+    paths: list[Picture]
+    paths_left_out: int
+    """How many more there would be."""
+    animation: Picture
+
+
+def draw(content: Content) -> Pictures:
+    """Draw all that a page shows."""
+    hardest = [_hard_picture(hard) for hard in content.hardest]
+    training = curves(content)
+    animation = _animation(content)
+    room = MOST_BYTES - sum(len(each.data) for each in (*hardest, *training, animation))
+    first = _first_drives(content.drives)
+    paths: list[Picture] = []
+    for drive in first:
+        paths.append(_paths(drive))
+        room -= len(paths[-1].data)
+        if room < 0:
+            break
+    return Pictures(hardest, training, paths, len(first) - len(paths), animation)
+
+
+def _plain(text: str) -> str:
+    """A name in a figure, where two dollar signs would begin and end a formula."""
+    return text.replace("$", r"\$")
+
+
+def _title(drive: Drive) -> str:
+    return f"{drive.agent.name} on {drive.world.occupancy_map.name}, {drive.world.tasks}"
+
+
+def _trajectories(drive: Drive, chosen: slice, title: str) -> Any:
+    """Episodes of a drive over the distance fields of their goals."""
+    config = drive.world.env_params.config
+    return figures.trajectories(
+        drive.world.occupancy_map,
+        drive.goals[chosen],
+        drive.poses[:, chosen],
+        drive.skill_weights[:, chosen],
+        drive.summary.success[chosen],
+        drive.summary.time_steps[chosen],
+        goal_radius=float(drive.world.env_params.goal_radius),
+        robot_radius=config.robot_radius,
+        title=_plain(title),
+    )
+
+
+def _hard_picture(hard: Hard) -> Picture:
+    """The path, and a circle around the place where the robot was most of the time."""
+    episode = slice(hard.episode, hard.episode + 1)
+    figure = _trajectories(hard.drive, episode, f"{_title(hard.drive)}, episode {hard.episode}")
+    _mark(figure.axes[0], hard.place, stuck=not hard.success and hard.place.is_most)
+    return Picture(
+        figures.picture(figure).png,
+        "The path of the robot over the distance to its goal, with a circle around the place "
+        f"({hard.place.x:.1f}, {hard.place.y:.1f}) m.",
+        f"The circle, {NEAR:g} m around ({hard.place.x:.1f}, {hard.place.y:.1f}) m, is the place "
+        "where the robot was most of the time.",
+    )
+
+
+def _mark(axes: Any, place: Place, *, stuck: bool) -> None:
+    """A circle around a place, with a word above it or, near the upper edge, below it."""
+    turn = np.linspace(0, 2 * np.pi, 100)
+    for colour, width in ((_PAPER, 4.5), (_INK, 2.0)):
+        x, y = place.x + NEAR * np.cos(turn), place.y + NEAR * np.sin(turn)
+        axes.plot(x, y, color=colour, lw=width, zorder=8)
+    (left, right), (_, top) = axes.get_xlim(), axes.get_ylim()
+    above = place.y + NEAR < 0.9 * top
+    across = (place.x - left) / (right - left)
+    axes.annotate(
+        "stuck here" if stuck else "longest here",
+        (place.x, place.y + (NEAR if above else -NEAR)),
+        (0, 5 if above else -5),
+        textcoords="offset points",
+        ha="left" if across < 0.1 else "right" if across > 0.9 else "center",
+        va="bottom" if above else "top",
+        fontsize=10,
+        fontweight="bold",
+        color=_INK,
+        bbox={"boxstyle": "round,pad=0.2", "fc": _PAPER, "ec": "none", "alpha": 0.85},
+        zorder=9,
+    )
+
+
+def curves(content: Content) -> list[Picture]:
+    """How training went: of one run all curves, of several the two that compare them."""
+    told = [run for run in content.runs if run.metrics]
+    if not told:
+        return []
+    if len(told) == 1:
+        (run,) = told
+        figure = figures.learning_curve(run.metrics, title=_plain(f"Training of {run.name}"))
+        return [_curve(figure, "Reward, success, loss and, of several skills, their weights.")]
+    rows = {id(run.policy): run.metrics for run in told}
+    by_agent = {
+        _plain(agent.name): [rows[id(p)] for p in agent.policies if id(p) in rows]
+        for agent in content.agents
+    }
+    by_agent = {name: runs for name, runs in by_agent.items() if runs}
+    pictures = [
+        _curve(
+            figures.learning_curves(by_agent, title="Training"),
+            "Mean reward and success under exploration noise; where an agent has several training "
+            "seeds, the line is their mean and the band a 95 % interval of it.",
+        )
+    ]
+    gated = {_plain(run.name): run.metrics for run in told if _tells_of_skills(run)}
+    if gated:
+        figure = figures.gate_entropy(gated, title="Entropy of the skill decision")
+        pictures.append(_curve(figure, "How evenly the skills share the decision."))
+    return pictures
+
+
+def _tells_of_skills(run: Run) -> bool:
+    """Whether every row of a run's metrics has what the curve of the skill decision needs."""
+    names = {"episodes", "gate_entropy", "skill_usage"}
+    config = run.policy.config
+    has_skills = config.algo == "sqn" and config.network.num_skills > 1
+    return has_skills and all(names <= row.keys() for row in run.metrics)
+
+
+def _curve(figure: Any, caption: str) -> Picture:
+    return Picture(figures.picture(figure).png, "Curves over the episodes of training.", caption)
+
+
+def _first_drives(drives: Sequence[Drive]) -> list[Drive]:
+    """Of each agent in each world the first training seed under the first evaluation seed."""
+    first: dict[tuple[str, int], Drive] = {}
+    for drive in drives:
+        first.setdefault((drive.agent.name, id(drive.world)), drive)
+    return list(first.values())
+
+
+def _paths(drive: Drive) -> Picture:
+    return Picture(
+        figures.picture(_trajectories(drive, slice(None), _title(drive))).png,
+        f"Paths of {_title(drive)}, over the distance to the goal.",
+        f"{_title(drive)}: {policy_words(drive)}, {len(drive.goals)} episodes under evaluation "
+        f"seed {drive.eval_seed}.",
+    )
+
+
+def policy_words(drive: Drive) -> str:
+    """Which of an agent's policies drove."""
+    return f"training seed {drive.agent.training_seeds[drive.index]}"
+
+
+def _animation(content: Content) -> Picture:
+    """The worst failure; if there is none, the first episode of all."""
+    failures = [hard for hard in content.hardest if not hard.success]
+    drive, number = content.drives[0], 0
+    if failures:
+        drive, number = failures[0].drive, failures[0].episode
+    episode = _recorded(drive, number)
+    outcome = f"not reached within {episode.num_steps:,} steps"
+    if episode.success:
+        outcome = f"reached after {episode.time_steps:,} steps"
+    data = gif(episode, count=_FRAMES, width_px=_FRAME_WIDTH_PX)
+    told = f"{_title(drive)}, episode {number} of evaluation seed {drive.eval_seed}: {outcome}"
+    note = ""
+    if episode.success != bool(drive.summary.success[number]):
+        note = (
+            " Driven again for the animation, it went otherwise than in the evaluation: sums are "
+            "rounded in another order, and one different turn is enough."
+        )
+    return Picture(data, f"An animation of {told}.", f"{told}.{note}")
+
+
+def _recorded(drive: Drive, number: int) -> Episode:
+    """One of the episodes with all that a picture of it needs, driven again alone."""
+    world, agent = drive.world, drive.agent
+    keys = episode_keys(task_key(drive.eval_seed, world.tasks), number + 1)[number:]
+    config = agent.policies[0].config
+    recording = record_episodes(
+        keys,
+        _params(agent, drive.index),
+        world.env_params,
+        algo=config.algo,
+        network_config=config.network,
+    )
+    (episode,) = on_host(recording, world, agent=_plain(agent.name))
+    return episode
+
+
+def _params(agent: Learnt, index: int) -> Any:
+    return [params for policy in agent.policies for params in policy.params][index]
