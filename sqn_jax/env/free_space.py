@@ -77,16 +77,23 @@ def far_sides(rectangles: NDArray[np.uint16]) -> NDArray[np.int16]:
 
 
 class _Sums:
-    """Summed-area table of a blocked map, padded with blocked cells beyond the far sides."""
+    """Summed-area table of a blocked map, padded with blocked cells beyond the far sides.
+
+    Rectangles are looked for from the F free cells only, which in a cave are few.
+    """
 
     def __init__(self, blocked: NDArray[np.bool_], reach: int) -> None:
-        self.shape = blocked.shape
+        self.free = ~blocked
         self.reach = reach
         height, width = blocked.shape
         padded = np.ones((height + reach + 2, width + reach + 2), np.int32)
         padded[:height, :width] = blocked
-        self.sums = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int32)
-        np.cumsum(np.cumsum(padded, axis=0), axis=1, out=self.sums[1:, 1:])
+        sums = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int32)
+        np.cumsum(np.cumsum(padded, axis=0), axis=1, out=sums[1:, 1:])
+        rows, columns = np.nonzero(self.free)
+        self.stride = sums.shape[1]
+        self.sums = sums.reshape(-1)
+        self.corners = rows * self.stride + columns
 
     def largest_free(self, cosine: float, sine: float) -> NDArray[np.uint16]:
         """The free rectangle from each cell towards +x, +y that takes a ray of the slope farthest.
@@ -107,24 +114,22 @@ class _Sums:
         )
         width = np.where(better, strip_width, width)
         height = np.where(better, strip_height, height)
-        return (width + 256 * height).astype(np.uint16)
+        table = np.zeros(self.free.shape, np.uint16)
+        table[self.free] = width + 256 * height
+        return table
 
     def _longest(
         self, widths: NDArray[np.integer], heights: NDArray[np.integer]
     ) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-        """Width and height [H, W] of the last free one of nested candidates, by binary search."""
-        rows, columns = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.int32)
-        free = np.zeros(self.shape, np.int32)
-        blocked = np.full(self.shape, self.reach + 1, np.int32)
+        """Width and height [F] of the last free one of nested candidates, by binary search."""
+        free = np.zeros(self.corners.shape, np.int32)
+        blocked = np.full(self.corners.shape, self.reach + 1, np.int32)
+        before = self.sums[self.corners]
+        ups, rights = heights.astype(np.intp) * self.stride, widths.astype(np.intp)
         while (blocked - free > 1).any():
             middle = np.minimum((free + blocked) // 2, self.reach)
-            top, right = rows + heights[middle], columns + widths[middle]
-            total = (
-                self.sums[top, right]
-                - self.sums[rows, right]
-                - self.sums[top, columns]
-                + self.sums[rows, columns]
-            )
+            up, right = self.corners + ups[middle], rights[middle]
+            total = self.sums[up + right] - self.sums[self.corners + right] - self.sums[up] + before
             free = np.where(total == 0, np.maximum(free, middle), free)
             blocked = np.where(total == 0, blocked, np.minimum(blocked, middle))
         return widths[free], heights[free]
