@@ -13,11 +13,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from experiments.common import run
+from experiments.common import ALGORITHMS, run
 from sqn_jax import figures
 from sqn_jax.maps import load_map
 from sqn_jax.presets import PAPER_MAPS
-from sqn_jax.pretrained import find_policy, pretrained_names
+from sqn_jax.pretrained import find_policy
 from sqn_jax.recording import Episode, record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,7 +65,7 @@ def skills() -> Any:
 
 def agents() -> Any:
     """The same tasks for every agent."""
-    driven = {name.upper(): episodes(name, "maze", 8)[:3] for name in pretrained_names()}
+    driven = {name.upper(): episodes(name, "maze", 8)[:3] for name in ALGORITHMS}
     return figures.agents_side_by_side(driven, title="The same tasks on the maze")
 
 

@@ -14,7 +14,10 @@ from typing import Any
 from sqn_jax.config import to_dict
 from sqn_jax.runlog import RunFolder
 
-CURVE = ("episodes", "wall_seconds", "updates", "mean_reward", "success", "loss", "gate_entropy")
+CURVE = (
+    *("episodes", "wall_seconds", "updates", "mean_reward", "success", "epsilon", "loss"),
+    *("gate_entropy", "skill_distance", "skill_usage"),
+)
 CURVE_ROWS = 50
 
 
