@@ -15,7 +15,7 @@ IS_NEW_ENOUGH := 'import sys; sys.exit(sys.version_info < (3, 11))'
 IS_USABLE := 'import sys, pip; sys.exit(sys.version_info < (3, 11))'
 
 .DEFAULT_GOAL := help
-.PHONY: help train test test-long table robustness lint maps clean
+.PHONY: help train test test-long table robustness lint maps notebooks clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -43,6 +43,12 @@ lint: $(INSTALLED)  ## check style, format and types
 
 maps: $(INSTALLED)  ## draw the maps in maps/ anew
 	@$(BIN)/python experiments/draw_maps.py $(ARGS)
+
+notebooks: $(INSTALLED)  ## run the notebooks in full and keep what they show; names in ARGS
+	@$(BIN)/python -m pip install --no-input --disable-pip-version-check --progress-bar off \
+	  -c constraints.txt -e '.[notebooks]' >$(LOG) 2>&1 \
+	  || { tail -n 15 $(LOG) >&2 ; echo "Installation failed; all of it is in $(LOG)." >&2 ; exit 1 ; }
+	@$(BIN)/python notebooks/execute.py $(ARGS)
 
 clean:  ## remove the environment and the caches, keep the runs
 	@rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
