@@ -23,6 +23,7 @@ from typing import Literal, NoReturn
 
 from sqn_jax.config import TrainConfig
 from sqn_jax.presets import PAPER_MAPS, PRESETS
+from sqn_jax.signals import Interrupted, interruptible
 
 TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
     "points": "evaluation points",
@@ -50,8 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = _dispatch(words)
+        with interruptible():
+            code = _dispatch(words)
         sys.stdout.flush()
+    except Interrupted as stop:
+        print(f"\nsqn: stopped by {stop.signal.name}", file=sys.stderr)
+        code = stop.exit_code
     except BrokenPipeError:  # Whoever read along, say `head`, has enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
@@ -173,6 +178,7 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
 
 
 def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -> int:
+    from sqn_jax.checkpoint import FOLDER
     from sqn_jax.session import Stopped, train_session
 
     config = _with_absolute_map(config)
@@ -187,6 +193,10 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
     except Stopped as stop:
         print(f"saved; go on with `sqn train --run-dir {run_dir} --resume`", file=sys.stderr)
         return stop.exit_code
+    except KeyboardInterrupt:  # In the final evaluation, say: the training is saved.
+        if any((run_dir / FOLDER).glob("[0-9]*")):
+            print(f"\ngo on with `sqn train --run-dir {run_dir} --resume`", file=sys.stderr)
+        raise
     return 0
 
 
@@ -332,6 +342,9 @@ def _render(words: list[str]) -> int:
         if not (error.name or "").startswith("matplotlib"):
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    for word in options.runs:
+        if options.runs.count(word) > 1:
+            raise ValueError(f"{word}: comes twice, expected each run once")
     policies = [find_policy(word) for word in options.runs]
     render.render_session(
         policies,

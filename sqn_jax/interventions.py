@@ -54,7 +54,8 @@ def swap_skills(policy: Policy, order: Sequence[int] | None = None) -> Policy:
     """
     num_skills = _num_skills(policy)
     places = list(range(num_skills))[::-1] if order is None else list(order)
-    if sorted(places) != list(range(num_skills)):
+    whole = all(isinstance(place, int) for place in places)
+    if not whole or sorted(places) != list(range(num_skills)):
         raise ValueError(f"order is {places}, expected a permutation of 0 to {num_skills - 1}")
     chosen = np.array(places)
     return _with_output(policy, lambda kernel, bias: (kernel[:, chosen], bias[chosen]))

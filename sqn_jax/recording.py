@@ -20,7 +20,17 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import Params, QOutput, make_network
-from sqn_jax.compare import Learnt, Settings, Tasks, World, load_maps, robot_for, task_key, worlds
+from sqn_jax.compare import (
+    SPAWN_MODES,
+    Learnt,
+    Settings,
+    Tasks,
+    World,
+    load_maps,
+    robot_for,
+    task_key,
+    worlds,
+)
 from sqn_jax.config import Algorithm, NetworkConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
 from sqn_jax.env.coverage import Lattice
@@ -240,6 +250,10 @@ def record(
     Raises:
         ValueError: the map is unusable, or a setting is out of its range.
     """
+    if tasks not in SPAWN_MODES:
+        raise ValueError(f"tasks is {tasks!r}, expected one of {', '.join(SPAWN_MODES)}")
+    if not 0 <= index < len(policy.params):
+        raise ValueError(f"index is {index}, expected 0 to {len(policy.params) - 1}")
     settings = Settings((map_name,), (tasks,), episodes, 1, seed, (noise,), max_steps=max_steps)
     agent = Learnt(policy.config.algo, (policy,))
     maps = load_maps([agent], settings)

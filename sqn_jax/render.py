@@ -21,7 +21,7 @@ from sqn_jax.compare import Learnt, Settings, Tasks, World, load_maps, robot_for
 from sqn_jax.compilation import kept_programs
 from sqn_jax.config import EnvConfig
 from sqn_jax.figures import animation
-from sqn_jax.figures.skills import MAX_TASKS
+from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.policies import Policy
 from sqn_jax.recording import Episode, record_world
 from sqn_jax.runlog import probe_writable
@@ -65,8 +65,8 @@ def render_session(
         agent a timeline of its first episode and its films.
 
     Raises:
-        ValueError: an option is out of its range, the map is unusable for a robot, policies cannot
-            be told apart, or the folder cannot be written.
+        ValueError: an option is out of its range, the map is unusable for a robot, there are too
+            many policies, or the folder cannot be written.
     """
     if not 1 <= episodes <= MOST_EPISODES:
         raise ValueError(f"episodes is {episodes}, expected 1 to {MOST_EPISODES}")
@@ -103,20 +103,27 @@ def render_session(
 def agent_names(policies: Sequence[Policy]) -> dict[str, Policy]:
     """What the policies are called in pictures: as their network, and as their run if need be.
 
+    Those that would be called the same are numbered; of several training seeds the first drives.
+
     Raises:
-        ValueError: there is none, or two would be called the same.
+        ValueError: there is none, or there are too many to stand side by side.
     """
-    if not policies:
-        raise ValueError("nothing to render: expected at least one policy")
+    if not 1 <= len(policies) <= MAX_AGENTS:
+        raise ValueError(f"{len(policies)} policies to render, expected 1 to {MAX_AGENTS}")
     algorithms = [policy.config.algo for policy in policies]
     names: dict[str, Policy] = {}
     for policy in policies:
         name = policy.config.algo.upper()
         if algorithms.count(policy.config.algo) > 1:
             name += f" {policy.name}"
-        if _file_name(name) in map(_file_name, names):
-            raise ValueError(f"policy {policy.name}: comes twice, expected runs of different names")
-        names[name] = policy
+        if len(policy.params) > 1:
+            name += f" seed {policy.training_seeds[0]}"
+        taken = [_file_name(other) for other in names]
+        number, full = 1, name
+        while _file_name(full) in taken:
+            number += 1
+            full = f"{name} ({number})"
+        names[full] = policy
     return names
 
 
@@ -129,7 +136,7 @@ def default_folder(policies: Sequence[Policy], map_name: str) -> Path:
 
 
 def _file_name(agent: str) -> str:
-    return re.sub(r"[^a-z0-9.-]+", "_", agent.lower())
+    return re.sub(r"[^\w.-]+", "_", agent.lower()).strip("_")
 
 
 def _make_folder(out: Path) -> None:
@@ -178,6 +185,9 @@ def _draw_paths(driven: Episodes, title: str, path: Path) -> None:
         figures.save(figures.skill_trajectories(episodes, title=f"{name} on {title}"), path)
         return
     first = {name: episodes[:MAX_TASKS] for name, episodes in driven.items()}
+    count = max(len(episodes) for episodes in driven.values())
+    if count > MAX_TASKS:
+        title += f", the first {MAX_TASKS} of {count} tasks"
     figures.save(figures.agents_side_by_side(first, title=title), path)
 
 

@@ -72,15 +72,26 @@ class RunFolder:
             file.write(json.dumps(_without_nan(row), allow_nan=False) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """The rows of metrics.jsonl; a half-written last line is left out."""
+        """The rows of metrics.jsonl; a half-written last line is left out.
+
+        Raises:
+            ValueError: another line is damaged.
+        """
         path = self.path / METRICS
         rows = []
-        if path.is_file():
-            for line in path.read_text(encoding="utf-8").splitlines():
-                try:
-                    rows.append(json.loads(line))
-                except json.JSONDecodeError:
+        lines = path.read_bytes().splitlines() if path.is_file() else []
+        for number, line in enumerate(lines, start=1):
+            try:
+                row = json.loads(line.decode("utf-8"))
+            except ValueError:
+                if number == len(lines):
                     break
+                row = None
+            if not isinstance(row, dict) or not isinstance(row.get("chunk"), int):
+                raise ValueError(
+                    f"{path}: line {number} is damaged, expected an object with a chunk number"
+                )
+            rows.append(row)
         return rows
 
     def keep_metrics(self, chunks: int) -> None:

@@ -156,9 +156,12 @@ def _train(
     on_row: Callable[[dict[str, Any]], None] | None,
 ) -> tuple[RunnerState, dict[str, float]]:
     """Drive the training to its end; returns the final state and how long it took."""
-    timing: dict[str, float] = {"train_seconds": seconds_before, "env_steps": 0.0}
-    timing["num_devices"] = 1 if mesh is None else mesh.size
     episodes_a_chunk = config.rounds_per_chunk * config.num_envs
+    rounds_done = int(np.max(np.asarray(runner.round)))
+    steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
+    timing: dict[str, float] = {"train_seconds": seconds_before}
+    timing["env_steps"] = rounds_done * steps_a_round
+    timing["num_devices"] = 1 if mesh is None else mesh.size
     print("compiling ...", end="", flush=True)
     with watched_compilation() as was_read:
         program, timing["compile_seconds"] = compile_chunk(env_params, config, mesh)
@@ -166,12 +169,11 @@ def _train(
     how = "compiled earlier, read" if was_read() else "compiled"
     print(f"\r{how} in {timing['compile_seconds']:.1f} s")
     last_saved = time.monotonic()
-    rounds_done = int(np.max(np.asarray(runner.round)))
     total = config.num_rounds * config.num_envs
     with _signals() as received, _bar(total, rounds_done * config.num_envs) as bar:
         for runner, report in run(runner, env_params, config, program, mesh):  # noqa: B020
             timing["train_seconds"] += report.seconds
-            timing["env_steps"] += episodes_a_chunk * config.num_seeds * env_params.max_steps
+            timing["env_steps"] += config.rounds_per_chunk * steps_a_round
             row = _row(report, timing["train_seconds"], env_params, config)
             folder.append_metrics(row)
             if on_row is not None:

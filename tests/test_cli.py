@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sqn_jax import session
+from sqn_jax import cli, session
 from sqn_jax.cli import main
+from sqn_jax.runlog import RunFolder
 
 TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4"]
 
@@ -123,6 +124,11 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     assert main(["train", "--resume", "--run-dir", str(broken)]) == 0
     assert metrics_of(broken) == metrics_of(straight)
     assert [row["chunk"] for row in metrics_of(broken)] == [1, 2]
+    summaries = [json.loads((run / "summary.json").read_text()) for run in (straight, broken)]
+    for told_by in summaries:  # Of the whole run, whatever of it was before the resumption.
+        assert told_by["steps_per_second"] == pytest.approx(
+            64 * 30 / told_by["wall_seconds"], rel=0.5
+        )
     evaluations = [json.loads((run / "evaluation.json").read_text()) for run in (straight, broken)]
     assert evaluations[0] == evaluations[1]
     capsys.readouterr()
@@ -145,3 +151,37 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
         "trajectories_evaluation_points.png",
         "trajectories_random_pairs.png",
     ]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_anywhere_is_one_line_and_its_exit_code(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is on its way up may clean up, and afterwards signals are what they were."""
+    cleaned: list[bool] = []
+
+    def hit(words: list[str]) -> int:
+        try:
+            os.kill(os.getpid(), number)
+            raise AssertionError("not stopped")
+        finally:
+            cleaned.append(True)
+
+    monkeypatch.setitem(cli._COMMANDS, "map", hit)
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    assert main(["map", "check", "maze"]) == 128 + number
+    assert capsys.readouterr().err.strip() == f"sqn: stopped by {number.name}"
+    assert cleaned == [True]
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_damaged_line_of_metrics_is_named_and_a_half_written_last_one_left_out(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b'{"chunk": 1}\n{"chunk": 2}\n{"chu')
+    assert RunFolder(tmp_path).read_metrics() == [{"chunk": 1}, {"chunk": 2}]
+    for damaged in (b'{"chu', b"\xff\xfe", b"3", b"[1, 2]", b"null", b'{"chunk": "x"}'):
+        path.write_bytes(b'{"chunk": 1}\n' + damaged + b'\n{"chunk": 3}\n')
+        with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
+            RunFolder(tmp_path).read_metrics()

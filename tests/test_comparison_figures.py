@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from episodes import episode
+from episodes import episode, walled_room
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Circle, Polygon
+from matplotlib.text import Text
 from test_figures import check_texts
 
 from sqn_jax import figures
@@ -195,3 +196,35 @@ def test_runs_that_do_not_know_the_distance_have_one_panel_and_seeds_are_thin() 
 def test_runs_without_a_skill_decision_are_refused_by_name(runs: Any, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         figures.gate_entropy(runs, title="none")
+
+
+def test_names_with_dollar_signs_are_no_formulas() -> None:
+    """Half a formula would end every drawing with an error."""
+    name = r"$\frac{$ and $x^2$"
+    skilled = [row | {"gate_entropy": 0.5, "skill_usage": [0.5, 0.5]} for row in rows([0.0], [0.5])]
+    driven = episode(occupancy_map=walled_room(name), agent=name)
+    drawn = [
+        figures.map_gallery([walled_room(name)]),
+        figures.learning_curve(skilled, title=name),
+        figures.learning_curves({name: [skilled]}, title=name),
+        figures.gate_entropy({name: skilled}, title=name),
+        figures.robustness([entry(name, 0.0, 0.0, 0.5)], title=name),
+        figures.observation_patterns([driven], title=name),
+        figures.coverage_example(driven, title=name),
+        figures.episode_timeline(driven, title=name),
+        figures.skill_trajectories([driven], title=name),
+        figures.agents_side_by_side({name: [driven]}, title=name),
+    ]
+    for figure in drawn:
+        assert figures.picture(figure).png
+        shown = " ".join(text.get_text() for text in figure.findobj(Text))
+        assert name.replace("$", r"\$") in shown
+        assert name not in shown
+    assert figures.gif(driven, count=2, width_px=320)
+
+
+def test_no_agents_are_refused() -> None:
+    with pytest.raises(ValueError, match="no runs"):
+        figures.learning_curves({}, title="nothing")
+    with pytest.raises(ValueError, match="6 agents, expected at most 5"):
+        figures.agents_side_by_side({str(n): [episode()] for n in range(6)}, title="many")

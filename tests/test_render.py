@@ -88,8 +88,13 @@ def test_agents_of_one_network_are_told_apart_by_their_runs() -> None:
         for name, algo in (("a", "sqn"), ("b", "sqn"), ("c", "dqn"))
     )
     assert list(agent_names([one, two, other])) == ["SQN a", "SQN b", "DQN"]
-    with pytest.raises(ValueError, match="policy a: comes twice"):
-        agent_names([one, one])
+    accented = [Policy(name, one.config, ()) for name in ("a/run", "\u00e9", "\u00e8", "a_run")]
+    names = list(agent_names(accented))
+    assert names == ["SQN a/run", "SQN \u00e9", "SQN \u00e8", "SQN a_run (2)"]
+    with pytest.raises(ValueError, match="6 policies to render, expected 1 to 5"):
+        agent_names([one] * 6)
+    several = Policy("s", dataclasses.replace(TINY, seed=7, num_seeds=2), (1, 2))
+    assert list(agent_names([several])) == ["SQN seed 7"]
     assert default_folder([one], "maze") == Path("renders/a_maze")
     assert default_folder([one, two, other], "my/maps/attic.yaml") == Path(
         "renders/a_and_2_more_attic"

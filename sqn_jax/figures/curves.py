@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, tidy
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
 from sqn_jax.statistics import bootstrap_interval
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     if not rows or any("episodes" not in row for row in rows):
         raise ValueError(f"{len(rows)} rows of metrics, expected at least one, all with episodes")
     episodes = _metric(rows, "episodes").max(axis=1)
-    skills = np.shape(rows[0].get("skill_usage", [1.0]))[-1]
+    skills = np.shape(rows[0].get("skill_usage") or [1.0])[-1]
     figure = Figure(figsize=(WIDTH_IN, 6.4 if skills > 1 else 3.7), dpi=DPI, layout="constrained")
     lines, columns = (2, 2) if skills > 1 else (1, 3)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
@@ -85,7 +85,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
             axes.set_xlabel("training episodes")
     seeds = _metric(rows, "mean_reward").shape[1]
     suffix = f" (thin: {seeds} seeds, bold: their mean)" if seeds > 1 else ""
-    figure.suptitle(title + suffix, fontsize=13)
+    figure.suptitle(plain(title + suffix), fontsize=13)
     return figure
 
 
@@ -160,8 +160,10 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
         interval of it; with one seed there is no band.
 
     Raises:
-        ValueError: an agent has no rows.
+        ValueError: there are no agents, or one has no rows.
     """
+    if not runs:
+        raise ValueError("no runs, expected at least one agent")
     figure = Figure(figsize=(WIDTH_IN, 3.6), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, 2)
     for number, (agent, rows_of_runs) in enumerate(runs.items()):
@@ -171,7 +173,7 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
         episodes = np.array([row["episodes"] for row in rows_of_runs[0][:length]], float)
         for axes, name in zip(panels, ("mean_reward", "success"), strict=True):
             values = np.concatenate([_metric(rows[:length], name) for rows in rows_of_runs], axis=1)
-            _draw_band(axes, episodes, values, COLOURS[number % len(COLOURS)], agent)
+            _draw_band(axes, episodes, values, COLOURS[number % len(COLOURS)], plain(agent))
     for axes, name in zip(panels, ("mean reward a step", "success while training"), strict=True):
         axes.set_title(name, fontsize=11)
         axes.set_xlabel("episodes")
@@ -179,7 +181,7 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
         tidy(axes)
     panels[1].set_ylim(0, 1.02)
     panels[0].legend(frameon=False)
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     return figure
 
 
@@ -229,9 +231,11 @@ def gate_entropy(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
         colour = COLOURS[number % len(COLOURS)]
         episodes = _metric(rows, "episodes").max(axis=1)
         largest = math.log(np.shape(rows[0]["skill_usage"])[-1])
-        _draw_curve(panels[0], episodes, _metric(rows, "gate_entropy") / largest, colour, run)
+        _draw_curve(
+            panels[0], episodes, _metric(rows, "gate_entropy") / largest, colour, plain(run)
+        )
         if any("skill_distance" in row for row in rows):
-            _draw_curve(panels[1], episodes, _metric(rows, "skill_distance"), colour, run)
+            _draw_curve(panels[1], episodes, _metric(rows, "skill_distance"), colour, plain(run))
     for axes, name in zip(panels, names, strict=True):
         axes.set_title(name, fontsize=11)
         axes.set_xlabel("training episodes")
@@ -243,5 +247,5 @@ def gate_entropy(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
     handles, labels = panels[0].get_legend_handles_labels()
     columns = min(len(labels), 4)
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     return figure

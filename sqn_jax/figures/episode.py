@@ -24,7 +24,7 @@ from sqn_jax.figures.ground import (
     draw_start,
     mark_arrival,
 )
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, tidy
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
 from sqn_jax.recording import Episode
 
 Floats = NDArray[np.floating]
@@ -88,7 +88,7 @@ def coverage_example(
         ],
         **_LEGEND_BELOW,
     )
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     return figure
 
 
@@ -207,7 +207,7 @@ def reachability_example(
         ],
         **_LEGEND_BELOW,
     )
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     return figure
 
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
 from sqn_jax.figures.ground import arrowhead, draw_map
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.recording import Episode
 
@@ -43,7 +43,7 @@ def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
     """A map with its name and its size."""
     width_m, height_m = occupancy_map.size_m
     draw_map(axes, occupancy_map)
-    axes.set_title(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m", fontsize=10)
+    axes.set_title(plain(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m"), fontsize=10)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("x [m]", fontsize=8)
 
@@ -101,7 +101,7 @@ def observation_patterns(
                 figure.add_subplot(below[divmod(number, columns)]), episode, index, letter
             )
     reach = f"{episodes[0].max_range:g} m"
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     figure.supxlabel(
         f"circle: {reach}, the sensor's reach; the robot looks to the right", fontsize=9
     )

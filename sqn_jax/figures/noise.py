@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sqn_jax.figures.style import COLOURS, DPI, WIDTH_IN, tidy
+from sqn_jax.figures.style import COLOURS, DPI, WIDTH_IN, plain, tidy
 
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
@@ -49,7 +49,7 @@ def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
                 color=COLOURS[number % len(COLOURS)],
                 marker=_MARKERS[number % len(_MARKERS)],
                 capsize=3,
-                label=agent,
+                label=plain(agent),
             )
         unit = results[0][f"{noise}_unit"]
         axes.set_xlabel(_NOISE_LABELS[noise, unit])
@@ -57,7 +57,7 @@ def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
     panels[0].set_ylabel("success")
     panels[0].set_ylim(0, 1.02)
     panels[0].legend(frameon=False)
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     return figure
 
 

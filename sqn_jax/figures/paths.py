@@ -16,7 +16,7 @@ from matplotlib.patches import Circle, Patch
 from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.figures.ground import RED, UNREACHABLE, YELLOW, draw_cross, draw_field
-from sqn_jax.figures.style import COLOURS, DPI, INK, OBSTACLE, WIDTH_IN
+from sqn_jax.figures.style import COLOURS, DPI, INK, OBSTACLE, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
 Floats = NDArray[np.float64]
@@ -103,7 +103,7 @@ def trajectories(
         shown += f", {len(panels)} of {len(all_panels)} goals shown"
     if max(panel.total for panel in panels) > MAX_PATHS:
         shown += f", at most {MAX_PATHS} paths a goal drawn"
-    figure.suptitle(f"{title}\n{shown}", fontsize=12)
+    figure.suptitle(plain(f"{title}\n{shown}"), fontsize=12)
     # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
     figure.draw_without_rendering()
     return figure

@@ -20,10 +20,11 @@ from sqn_jax.figures.ground import (
     scale_below,
     skill_bar,
 )
-from sqn_jax.figures.style import DPI, WIDTH_IN
+from sqn_jax.figures.style import DPI, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 from sqn_jax.recording import Episode
 
+MAX_AGENTS = 5  # columns of `agents_side_by_side`; more would be too narrow for their titles
 MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit a page
 
 
@@ -56,7 +57,7 @@ def skill_trajectories(episodes: Sequence[Episode], *, title: str) -> Figure:
             draw_skill_path(axes, episode)
         reached = sum(episode.success for episode in group)
         name = group[0].occupancy_map.name
-        axes.set_title(f"{name}: {reached} of {len(group)} reached", fontsize=10)
+        axes.set_title(plain(f"{name}: {reached} of {len(group)} reached"), fontsize=10)
     _finish(figure, grid, episodes, title)
     return figure
 
@@ -74,7 +75,8 @@ def agents_side_by_side(
         title: stands above all panels.
 
     Raises:
-        ValueError: no agent, no episode or too many, or tasks that differ between agents.
+        ValueError: no agent or more than 5, no episode or too many, or tasks that differ between
+            agents.
     """
     _check_tasks(episodes_by_agent)
     columns = list(episodes_by_agent.values())
@@ -89,7 +91,7 @@ def agents_side_by_side(
             image = draw_field(axes, episode.occupancy_map, field, norm)
             draw_skill_path(axes, episode)
             told = f"{episode.time_steps} steps" if episode.success else "not reached"
-            axes.set_title(f"{agent}: {told}", fontsize=10)
+            axes.set_title(plain(f"{agent}: {told}"), fontsize=10)
     scale_below(figure, image, grid, "distance to the goal, m")
     _finish(figure, grid, [episode for task in tasks for episode in task], title)
     return figure
@@ -99,6 +101,8 @@ def _check_tasks(episodes_by_agent: Mapping[str, Sequence[Episode]]) -> None:
     """Refuse agents that were not given the same tasks."""
     if not episodes_by_agent:
         raise ValueError("no agents, expected at least one")
+    if len(episodes_by_agent) > MAX_AGENTS:
+        raise ValueError(f"{len(episodes_by_agent)} agents, expected at most {MAX_AGENTS}")
     first, reference = next(iter(episodes_by_agent.items()))
     for agent, episodes in episodes_by_agent.items():
         if not 1 <= len(episodes) <= MAX_TASKS:
@@ -162,6 +166,6 @@ def _finish(figure: Figure, grid: Sequence[Axes], episodes: Sequence[Episode], t
     handles = path_legend(episodes)
     look: dict[str, Any] = {"loc": "outside lower center", "ncols": min(len(handles), 5)}
     figure.legend(handles=handles, frameon=False, fontsize=9, **look)
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
     figure.draw_without_rendering()

@@ -20,6 +20,11 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 INK, OBSTACLE = "#222222", "#333a42"
 
 
+def plain(text: str) -> str:
+    """A text that may hold names, for Matplotlib, which takes dollar signs for formulas."""
+    return text.replace("$", r"\$")
+
+
 def tidy(axes: Axes) -> None:
     """A light grid, and no frame at the top and at the right."""
     axes.grid(color="0.9")

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sqn_jax.figures.ground import mark_arrival, skill_colour
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, tidy
+from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
 from sqn_jax.recording import Episode
 
 _REWARD_PARTS = ("navigation", "exploration", "time")
@@ -58,7 +58,7 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
     seconds = episode.time_steps * episode.time_step
     outcome = f"{episode.time_steps} steps, {seconds:.1f} s"
     word = "reached after" if episode.success else "not reached in"
-    figure.suptitle(f"{title}\ngoal {word} {outcome}", fontsize=12)
+    figure.suptitle(plain(f"{title}\ngoal {word} {outcome}"), fontsize=12)
     return figure
 
 

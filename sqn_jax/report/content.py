@@ -73,7 +73,9 @@ def read_runs(words: Sequence[str]) -> list[Run]:
     runs = [_read_run(word) for word in words]
     times = Counter(run.name for run in runs)
     return [
-        replace(run, name=word) if times[run.name] > 1 else run
+        replace(run, name=word, policy=replace(run.policy, name=word))
+        if times[run.name] > 1
+        else run
         for word, run in zip(words, runs, strict=True)
     ]
 

@@ -62,11 +62,6 @@ def draw(content: Content) -> Pictures:
     return Pictures(hardest, training, paths, len(first) - len(paths), animation)
 
 
-def _plain(text: str) -> str:
-    """A name in a figure, where two dollar signs would begin and end a formula."""
-    return text.replace("$", r"\$")
-
-
 def _title(drive: Drive) -> str:
     return f"{drive.agent.name} on {drive.world.occupancy_map.name}, {drive.world.tasks}"
 
@@ -83,7 +78,7 @@ def _trajectories(drive: Drive, chosen: slice, title: str) -> Any:
         drive.summary.time_steps[chosen],
         goal_radius=float(drive.world.env_params.goal_radius),
         robot_radius=config.robot_radius,
-        title=_plain(title),
+        title=title,
     )
 
 
@@ -132,11 +127,11 @@ def curves(content: Content) -> list[Picture]:
         return []
     if len(told) == 1:
         (run,) = told
-        figure = figures.learning_curve(run.metrics, title=_plain(f"Training of {run.name}"))
+        figure = figures.learning_curve(run.metrics, title=f"Training of {run.name}")
         return [_curve(figure, "Reward, success, loss and, of several skills, their weights.")]
     rows = {id(run.policy): run.metrics for run in told}
     by_agent = {
-        _plain(agent.name): [rows[id(p)] for p in agent.policies if id(p) in rows]
+        agent.name: [rows[id(p)] for p in agent.policies if id(p) in rows]
         for agent in content.agents
     }
     by_agent = {name: runs for name, runs in by_agent.items() if runs}
@@ -147,7 +142,7 @@ def curves(content: Content) -> list[Picture]:
             "seeds, the line is their mean and the band a 95 % interval of it.",
         )
     ]
-    gated = {_plain(run.name): run.metrics for run in told if _tells_of_skills(run)}
+    gated = {run.name: run.metrics for run in told if _tells_of_skills(run)}
     if gated:
         figure = figures.gate_entropy(gated, title="Entropy of the skill decision")
         pictures.append(_curve(figure, "How evenly the skills share the decision."))
@@ -221,7 +216,7 @@ def _recorded(drive: Drive, number: int) -> Episode:
         algo=config.algo,
         network_config=config.network,
     )
-    (episode,) = on_host(recording, world, agent=_plain(agent.name))
+    (episode,) = on_host(recording, world, agent=agent.name)
     return episode
 
 
