@@ -7,6 +7,7 @@ and noise come from the records in experiments/results/. Everything goes to docs
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Callable
 from functools import cache
@@ -27,7 +28,8 @@ OUT, RESULTS = ROOT / "docs" / "images", ROOT / "experiments" / "results"
 @cache
 def episodes(agent: str, map_name: str, count: int) -> tuple[Episode, ...]:
     """The first episodes from the evaluation points, under the evaluation's first seed."""
-    return tuple(record(find_policy(f"pretrained:{agent}"), map_name, episodes=count))
+    driven = record(find_policy(f"pretrained:{agent}"), map_name, episodes=count)
+    return tuple(dataclasses.replace(episode, agent=agent.upper()) for episode in driven)
 
 
 def maps() -> Any:

@@ -5,9 +5,7 @@ Every policy drives the same tasks, `recording` keeps them whole, `figures` draw
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +22,7 @@ from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.policies import Policy
 from sqn_jax.recording import Episode, record_world
-from sqn_jax.runlog import probe_writable
+from sqn_jax.runlog import probe_writable, written_whole
 
 MOST_EPISODES = 32
 """Of each policy; an episode in the cave takes 7 MB of memory."""
@@ -197,15 +195,8 @@ def _draw_timeline(episode: Episode, title: str, path: Path) -> None:
 
 def _draw_gif(episode: Episode, path: Path) -> None:
     film = animation.gif(episode)
-    partial_path = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with written_whole(path) as partial_path:
         partial_path.write_bytes(film)
-        partial_path.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial_path.unlink()
 
 
 def _draw_mp4(episode: Episode, path: Path) -> None:

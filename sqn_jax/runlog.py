@@ -14,7 +14,8 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,24 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
     """Write a JSON lines file as a whole or not at all; NaN becomes null."""
     lines = [json.dumps(_without_nan(record), allow_nan=False) + "\n" for record in records]
     _write_whole(path, "".join(lines))
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A hidden name beside `path` to write to, which becomes `path` at the end or vanishes.
+
+    Raises:
+        ValueError: the file cannot be written.
+    """
+    partial = path.absolute().with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink()
 
 
 def _write_whole(path: Path, text: str) -> None:

@@ -97,7 +97,10 @@ def test_items_are_fetched_from_whichever_device_holds_them(mesh: Mesh, dtype: A
     np.testing.assert_array_equal(alone, stored[rows, columns])
 
 
-@pytest.mark.parametrize(("method", "num_seeds"), [("pqn", 1), ("r2d2", 1), ("r2d2", 2)])
+@pytest.mark.parametrize(
+    ("method", "num_seeds"),
+    [("pqn", 1), ("r2d2", 1), pytest.param("r2d2", 2, marks=pytest.mark.long)],
+)
 def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_seeds: int) -> None:
     """To the rounding of sums: the same tasks, actions, noise and drawn episodes."""
     config = config_for(method, num_seeds=num_seeds)

@@ -308,8 +308,9 @@ def test_the_ends_of_the_weight_scale_differ_in_brightness():
     figure = draw(episodes(GOALS[:1], [True], [12]))
     colours = paths(panels(figure)[0])[0].get_cmap()(np.linspace(0, 1, 32))[:, :3]
     luma = colours @ [0.299, 0.587, 0.114]
-    assert (np.diff(luma) > 0).all()
-    assert luma[-1] - luma[0] > 0.4
+    assert (np.diff(luma) < 0).all()
+    assert luma[0] - luma[-1] > 0.4
+    assert colours[-1] @ [0, 0, 1] > colours[-1] @ [1, 0, 0], "skill 1 is blue in all pictures"
 
 
 def test_one_skill_has_one_colour_and_no_scale_for_it():

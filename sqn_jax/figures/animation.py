@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from sqn_jax.figures.screen import HEIGHT, KEY_COLOURS, WIDTH, Screen, last_step, rgb
 from sqn_jax.recording import Episode
+from sqn_jax.runlog import written_whole
 
 Frame = NDArray[np.uint8]
 
@@ -145,15 +145,17 @@ def mp4(
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path}: the name ends in {path.suffix!r}, expected .mp4")
     film = frames(episode, count=count, width_px=width_px)
-    partial = path.absolute().with_name(f".{path.stem}.{os.getpid()}.partial.mp4")
     width, height = frame_size(width_px)
     words = f"-loglevel error -y -f rawvideo -pix_fmt rgb24 -s {width}x{height} "
     words += f"-r {frames_per_second} -i - -an -c:v libx264 -crf 22 -pix_fmt yuv420p"
-    command = [program, *words.split(), "-movflags", "+faststart", str(partial)]
-    try:
+    words += " -movflags +faststart"
+    with written_whole(path) as partial:
         # Not by imageio's writer: it forks, which JAX's threads may not survive.
         with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [program, *words.split(), str(partial)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
         ) as encoder:
             assert encoder.stdin is not None
             with contextlib.suppress(BrokenPipeError):
@@ -165,12 +167,6 @@ def mp4(
         if encoder.returncode != 0:
             told = complaint.decode(errors="replace").strip().splitlines() or ["no reason given"]
             raise ValueError(f"{path}: cannot be written (ffmpeg: {told[-1]})")
-        partial.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
 
 
 def require_mp4() -> str:

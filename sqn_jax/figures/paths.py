@@ -23,8 +23,9 @@ Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in one panel; more would hide each other
 
-# Dark blue over violet to orange: brightness rises all along, so that it survives greyscale.
-_WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.8, 256)))
+# From skill 2, orange, over violet to skill 1, dark blue, their colours in all pictures; darker all
+# along, so that it survives greyscale.
+_WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
 class _Panel(NamedTuple):

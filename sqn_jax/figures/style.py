@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from sqn_jax.runlog import written_whole
 
 DPI = 160
 WIDTH_IN = 9.0
@@ -64,13 +64,6 @@ def save(figure: Figure, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"{path}: the name ends in {path.suffix!r}, expected .png")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with written_whole(path) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write_png(figure, partial)
-        partial.replace(path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()

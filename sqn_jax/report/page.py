@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -19,7 +18,7 @@ from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import NEAR, Hard
 from sqn_jax.report.pictures import Picture, Pictures, policy_words
-from sqn_jax.runlog import CONFIG, probe_writable
+from sqn_jax.runlog import CONFIG, probe_writable, written_whole
 
 _REFERENCES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
 
@@ -81,14 +80,8 @@ def write(path: Path, html: str) -> None:
     Raises:
         ValueError: it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        # A folder's name need not be text; what is none becomes a question mark.
+    with written_whole(path) as partial:
         partial.write_text(html, encoding="utf-8", errors="replace", newline="\n")
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def to_html(content: Content, pictures: Pictures) -> str:
