@@ -124,11 +124,11 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     assert main(["train", "--resume", "--run-dir", str(broken)]) == 0
     assert metrics_of(broken) == metrics_of(straight)
     assert [row["chunk"] for row in metrics_of(broken)] == [1, 2]
-    summaries = [json.loads((run / "summary.json").read_text()) for run in (straight, broken)]
-    for told_by in summaries:  # Of the whole run, whatever of it was before the resumption.
-        assert told_by["steps_per_second"] == pytest.approx(
-            64 * 30 / told_by["wall_seconds"], rel=0.5
-        )
+    for run in (straight, broken):  # Of the whole run, whatever of it was before the resumption.
+        last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+        told_by = json.loads((run / "summary.json").read_text())
+        rate = 64 * 30 / last["wall_seconds"]
+        assert told_by["steps_per_second"] == pytest.approx(rate, rel=0.1)
     evaluations = [json.loads((run / "evaluation.json").read_text()) for run in (straight, broken)]
     assert evaluations[0] == evaluations[1]
     capsys.readouterr()
