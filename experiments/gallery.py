@@ -73,7 +73,7 @@ def agents() -> Any:
 
 def learning_curve() -> Any:
     """How the default preset learns, from the record of a run."""
-    rows = _recorded("pretrained_runs.json")["runs"][0]["curve"]
+    rows = _recorded("maze_quick.json")["runs"][0]["curve"]
     return figures.learning_curve(rows, title="SQN on maze")
 
 

@@ -62,6 +62,7 @@ def tiny_config(**changes: Any) -> TrainConfig:
     )
 
 
+@pytest.mark.long
 def test_updates_and_robots_divided_between_devices_are_those_of_one() -> None:
     """From the same batches: the same priorities, and priorities tell the parameters."""
     config = dataclasses.replace(
@@ -139,6 +140,7 @@ def test_the_pieces_of_a_step_add_up_to_the_step_itself() -> None:
         np.testing.assert_allclose(ranges / 5.0, obs.ranges, atol=1e-6)
 
 
+@pytest.mark.long
 def test_the_breakdown_tells_of_every_piece_and_of_both_halves_of_a_window() -> None:
     config = dataclasses.replace(PRESETS["smoke"], network=SIZES, num_envs=8)
     with compiling_quickly():
