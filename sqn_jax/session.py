@@ -37,6 +37,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies import Policy, seeds_of
+from sqn_jax.progress import episodes_bar
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder, write_json, write_records
 from sqn_jax.tensorboard import Board, require_tensorboard
@@ -170,7 +171,7 @@ def _train(
     print(f"\r{how} in {timing['compile_seconds']:.1f} s")
     last_saved = time.monotonic()
     total = config.num_rounds * config.num_envs
-    with _signals() as received, _bar(total, rounds_done * config.num_envs) as bar:
+    with _signals() as received, episodes_bar(total, rounds_done * config.num_envs) as bar:
         for runner, report in run(runner, env_params, config, program, mesh):  # noqa: B020
             timing["train_seconds"] += report.seconds
             timing["env_steps"] += config.rounds_per_chunk * steps_a_round
@@ -208,24 +209,12 @@ def evaluate_session(
         ValueError: a map is unusable for a robot; nothing was driven then.
     """
     maps = load_maps(agents, settings)
-    with _bar(num_episodes(agents, settings)) as bar:
+    with episodes_bar(num_episodes(agents, settings)) as bar:
         evaluation, records = evaluate_agents(agents, maps, settings, bar.update)
     if out is not None:
         write_json(out, evaluation)
         write_records(out.with_suffix(".jsonl"), records)
     return evaluation
-
-
-def _bar(episodes: int, done: int = 0) -> tqdm[Any]:
-    return tqdm(
-        total=episodes,
-        initial=done,
-        mininterval=0.5 if sys.stderr.isatty() else 20,
-        smoothing=0.1,
-        dynamic_ncols=True,
-        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
-        "[{elapsed}, {remaining} left{postfix}]",
-    )
 
 
 def _row(

@@ -34,6 +34,7 @@ RUN_LAYER = {
     "planners",
     "policies",
     "pretrained",
+    "progress",
     "recording",
     "render",
     "report",

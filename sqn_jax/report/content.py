@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from sqn_jax import config as configs
 from sqn_jax.compare import (
@@ -30,6 +28,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.policies import Policy
 from sqn_jax.presets import PRESETS
 from sqn_jax.pretrained import PREFIX, find_policy
+from sqn_jax.progress import episodes_bar
 from sqn_jax.report.episodes import Drive, Hard, hardest
 from sqn_jax.runlog import RunFolder
 
@@ -120,13 +119,7 @@ def gather(runs: Sequence[Run], settings: Settings, *, references: bool) -> Cont
         if isinstance(agent, Learnt):
             drives.append(_drive(agent, world, index, driven, drives, settings))
 
-    with tqdm(
-        total=num_episodes(agents, settings),
-        mininterval=0.5 if sys.stderr.isatty() else 20,
-        dynamic_ncols=True,
-        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
-        "[{elapsed}, {remaining} left]",
-    ) as bar:
+    with episodes_bar(num_episodes(agents, settings)) as bar:
         evaluation, _ = evaluate_agents(agents, maps, settings, bar.update, keep)
     print("looking at what went worst, and drawing it ...", flush=True)
     return Content(list(runs), learnt, settings, evaluation, drives, hardest(drives))

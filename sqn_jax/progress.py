@@ -1,0 +1,21 @@
+"""The bar that shows how far a command has come."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+
+def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
+    """A bar over episodes; where nobody watches, a line now and then."""
+    return tqdm(
+        total=total,
+        initial=done,
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        smoothing=0.1,
+        dynamic_ncols=True,
+        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
+        "[{elapsed}, {remaining} left{postfix}]",
+    )
