@@ -19,13 +19,15 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from sqn_jax.checks import (
+    require,
+    require_known_words,
+    require_not_negative,
+    require_positive,
+)
+
 Algorithm = Literal["sqn", "r2d2", "dqn"]
 Method = Literal["r2d2", "pqn"]
-
-
-def _require(condition: bool, name: str, value: object, expected: str) -> None:
-    if not condition:
-        raise ValueError(f"{name} is {value!r}, expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -81,31 +83,31 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         for name in ("max_range", "time_step", "goal_radius", "max_goal_distance", "coverage_cell"):
-            _require_positive(self, "env", name)
+            require_positive(self, "env", name)
         speeds_and_size = ("forward_speed", "backward_speed", "turn_rate", "robot_radius")
         for name in (*speeds_and_size, "velocity_noise", "range_noise"):
-            _require_not_negative(self, "env", name)
+            require_not_negative(self, "env", name)
         for name in ("reward_navigation", "reward_exploration", "reward_time"):
             value = getattr(self, name)
-            _require(math.isfinite(value), f"env.{name}", value, "a finite number")
-        _require_known_words(self, "env")
+            require(math.isfinite(value), f"env.{name}", value, "a finite number")
+        require_known_words(self, "env")
         value = self.near_goal_fraction
-        _require(0 <= value <= 1, "env.near_goal_fraction", value, "a number from 0 to 1")
-        _require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
-        _require(
+        require(0 <= value <= 1, "env.near_goal_fraction", value, "a number from 0 to 1")
+        require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
+        require(
             0 < self.field_of_view_deg < 360,
             "env.field_of_view_deg",
             self.field_of_view_deg,
             "more than 0 and less than 360 degrees",
         )
-        _require(self.max_steps >= 0, "env.max_steps", self.max_steps, "0 or a positive number")
-        _require(
+        require(self.max_steps >= 0, "env.max_steps", self.max_steps, "0 or a positive number")
+        require(
             self.ray_sectors >= 4 and self.ray_sectors % 4 == 0,
             "env.ray_sectors",
             self.ray_sectors,
             "a positive multiple of 4",
         )
-        _require(self.ray_iterations >= 1, "env.ray_iterations", self.ray_iterations, "at least 1")
+        require(self.ray_iterations >= 1, "env.ray_iterations", self.ray_iterations, "at least 1")
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):
             value = getattr(self, name)
-            _require(value >= 1, f"network.{name}", value, "at least 1")
+            require(value >= 1, f"network.{name}", value, "at least 1")
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,8 @@ class ReplayConfig:
     """Priority of a sequence: this share of the largest TD error, the rest of the mean one."""
 
     def __post_init__(self) -> None:
-        _require(self.capacity >= 1, "replay.capacity", self.capacity, "at least 1")
-        _require(
+        require(self.capacity >= 1, "replay.capacity", self.capacity, "at least 1")
+        require(
             1 <= self.min_episodes <= self.capacity,
             "replay.min_episodes",
             self.min_episodes,
@@ -154,7 +156,7 @@ class ReplayConfig:
         )
         for name in ("priority_exponent", "importance_exponent", "max_priority_weight"):
             value = getattr(self, name)
-            _require(0 <= value <= 1, f"replay.{name}", value, "a number from 0 to 1")
+            require(0 <= value <= 1, f"replay.{name}", value, "a number from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -197,20 +199,20 @@ class LearnerConfig:
     """pqn: a robot that is at its goal at the end of a window gets a new task."""
 
     def __post_init__(self) -> None:
-        _require_known_words(self, "learner")
+        require_known_words(self, "learner")
         for name in ("learning_rate", "adam_epsilon", "max_grad_norm"):
-            _require_positive(self, "learner", name)
+            require_positive(self, "learner", name)
         for name in ("batch_size", "n_step", "num_passes"):
             value = getattr(self, name)
-            _require(value >= 1, f"learner.{name}", value, "at least 1")
+            require(value >= 1, f"learner.{name}", value, "at least 1")
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
-            _require(value >= 0, f"learner.{name}", value, "0 or a positive number")
+            require(value >= 0, f"learner.{name}", value, "0 or a positive number")
         for name in ("discount", "discount_start", "trace_decay", "average_share"):
             value = getattr(self, name)
-            _require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
+            require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         value = self.target_update_rate
-        _require(0 < value <= 1, "learner.target_update_rate", value, "more than 0, at most 1")
+        require(0 < value <= 1, "learner.target_update_rate", value, "more than 0, at most 1")
 
 
 @dataclass(frozen=True)
@@ -229,9 +231,9 @@ class ExplorationConfig:
     def __post_init__(self) -> None:
         for name in ("epsilon_start", "epsilon_end"):
             value = getattr(self, name)
-            _require(0 <= value <= 1, f"exploration.{name}", value, "a number from 0 to 1")
+            require(0 <= value <= 1, f"exploration.{name}", value, "a number from 0 to 1")
         value = self.decay_fraction
-        _require(0 < value <= 1, "exploration.decay_fraction", value, "more than 0, at most 1")
+        require(0 < value <= 1, "exploration.decay_fraction", value, "more than 0, at most 1")
 
 
 @dataclass(frozen=True)
@@ -244,8 +246,8 @@ class EvalConfig:
     """Seed of the starts and goals; independent of the training seed."""
 
     def __post_init__(self) -> None:
-        _require(self.episodes >= 1, "eval.episodes", self.episodes, "at least 1")
-        _require(self.seed >= 0, "eval.seed", self.seed, "0 or a positive number")
+        require(self.episodes >= 1, "eval.episodes", self.episodes, "at least 1")
+        require(self.seed >= 0, "eval.seed", self.seed, "0 or a positive number")
 
 
 @dataclass(frozen=True)
@@ -272,6 +274,10 @@ class TrainConfig:
     """Rounds in one call of the compiled program; the host looks in between chunks."""
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints; one is always written at the end."""
+    checkpoint_replay: bool = True
+    """r2d2: save the replay, too; else a run goes on from an empty one, not as it would have."""
+    max_skipped_updates: int = 100
+    """Stop once more updates than this had a loss or gradient that is not finite."""
     env: EnvConfig = field(default_factory=EnvConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
@@ -280,27 +286,28 @@ class TrainConfig:
     eval: EvalConfig = field(default_factory=EvalConfig)
 
     def __post_init__(self) -> None:
-        _require_known_words(self, "")
-        _require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
+        require_known_words(self, "")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
         for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
             value = getattr(self, name)
-            _require(value >= 1, name, value, "at least 1")
-        _require(
+            require(value >= 1, name, value, "at least 1")
+        require(
             self.total_episodes >= self.num_envs,
             "total_episodes",
             self.total_episodes,
             f"at least num_envs ({self.num_envs}), one round",
         )
-        _require_positive(self, "", "checkpoint_minutes")
+        require_positive(self, "", "checkpoint_minutes")
+        require_not_negative(self, "", "max_skipped_updates")
         if self.method == "r2d2":
-            _require(
+            require(
                 self.replay.capacity % self.num_envs == 0,
                 "replay.capacity",
                 self.replay.capacity,
                 f"a multiple of num_envs ({self.num_envs}), which are stored a round at a time",
             )
         else:
-            _require(
+            require(
                 self.num_envs % self.learner.batch_size == 0,
                 "learner.batch_size",
                 self.learner.batch_size,
@@ -319,27 +326,6 @@ class TrainConfig:
         return self.num_rounds // self.rounds_per_chunk
 
 
-def _require_known_words(config: object, group: str) -> None:
-    """Check every field that is one of a few words."""
-    for name, hint in typing.get_type_hints(type(config)).items():
-        if typing.get_origin(hint) is Literal:
-            words = typing.get_args(hint)
-            value = getattr(config, name)
-            label = f"{group}.{name}" if group else name
-            _require(value in words, label, value, f"one of {', '.join(words)}")
-
-
-def _require_positive(config: object, group: str, name: str) -> None:
-    value = getattr(config, name)
-    label = f"{group}.{name}" if group else name
-    _require(math.isfinite(value) and value > 0, label, value, "a positive number")
-
-
-def _require_not_negative(config: object, group: str, name: str) -> None:
-    value = getattr(config, name)
-    _require(0 <= value < math.inf, f"{group}.{name}", value, "0 or a positive number")
-
-
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a config as nested plain dicts, ready for JSON."""
     return dataclasses.asdict(config)
@@ -352,12 +338,12 @@ def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
         ValueError: an unknown field, a value of the wrong type, or one out of range; the message
             names the field.
     """
-    _require(isinstance(data, dict), prefix.rstrip(".") or "config", data, "a mapping of fields")
+    require(isinstance(data, dict), prefix.rstrip(".") or "config", data, "a mapping of fields")
     known = {item.name: item for item in fields(cls)}
     hints = typing.get_type_hints(cls)
     values = {}
     for name, value in data.items():
-        _require(name in known, f"{prefix}{name}", value, f"one of the fields {sorted(known)}")
+        require(name in known, f"{prefix}{name}", value, f"one of the fields {sorted(known)}")
         if dataclasses.is_dataclass(hints[name]):
             value = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
         else:
@@ -373,7 +359,7 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
     assert not isinstance(hint, types.UnionType), "config fields have one type"
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    _require(type(value) is hint, label, value, f"a value of type {hint.__name__}")
+    require(type(value) is hint, label, value, f"a value of type {hint.__name__}")
     return value
 
 

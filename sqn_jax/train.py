@@ -193,12 +193,20 @@ def train_round(
     }
     metrics = mean(told, axis_name) | {
         "updates": learner.num_updates,
+        "skipped_updates": learner.num_skipped,
+        "finite": _is_finite(learner),
         "epsilon": epsilon_schedule(progress, config.exploration),
         "discount": jnp.asarray(discount, jnp.float32),
         **jax.tree.map(jnp.mean, learning),
     }
     new_runner = RunnerState(learner=learner, memory=memory, key=key, round=runner.round + 1)
     return new_runner, metrics
+
+
+def _is_finite(learner: LearnerState) -> Array:
+    """Whether all that learning has made is numbers."""
+    floats = [x for x in jax.tree.leaves(learner) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats]))
 
 
 def _drive_and_learn(
@@ -374,8 +382,12 @@ def run(
 def _average(metrics: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
     """Mean over the rounds of a chunk, as plain numbers (lists over seeds, lists over skills).
 
-    Updates are a count: their last value. Before learning has begun there is no loss: NaN.
+    Counts are those at the end. Before learning has begun there is no loss: NaN.
     """
     axis = 0 if config.num_seeds == 1 else 1
     means = {name: np.mean(value, axis=axis).tolist() for name, value in metrics.items()}
-    return means | {"updates": int(np.max(metrics["updates"]))}
+    return means | {
+        "updates": int(np.max(metrics["updates"])),
+        "skipped_updates": np.max(metrics["skipped_updates"], axis=axis).tolist(),
+        "finite": np.all(metrics["finite"], axis=axis).tolist(),
+    }

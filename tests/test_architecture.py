@@ -25,10 +25,14 @@ RUN_LAYER = {
     "bug",
     "checkpoint",
     "compare",
+    "divergence",
     "evaluate",
     "export",
     "figures",
     "interventions",
+    "lock",
+    "manifest",
+    "memory",
     "navigators",
     "paper",
     "planners",
@@ -44,9 +48,10 @@ RUN_LAYER = {
     "tensorboard",
     "train",
 }
-DEVICE_LAYER = {"config", "devices", "presets", "env", "agent", "rollout"}
+DEVICE_LAYER = {"checks", "config", "devices", "presets", "env", "agent", "rollout"}
 ARROWS: dict[str, set[str]] = {
-    "config": set(),
+    "checks": set(),
+    "config": {"checks"},
     "presets": {"config"},
     "maps": set(),
     "devices": {"config"},
@@ -60,11 +65,13 @@ ARROWS: dict[str, set[str]] = {
     "compilation": {"runlog"},
     "render": RUN_LAYER | DEVICE_LAYER | {"maps", "compilation"},
     "report": RUN_LAYER | DEVICE_LAYER | {"maps", "compilation"},
-    "session": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax", "compilation"},
+    "finish": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
+    "manifest": RUN_LAYER | DEVICE_LAYER | {"sqn_jax"},
+    "session": RUN_LAYER | DEVICE_LAYER | {"maps", "finish", "signals", "compilation"},
     "signals": set(),
     "cli": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "signals", "sqn_jax"},
     "__main__": {"cli"},
-    "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "sqn_jax"},
+    "experiments": RUN_LAYER | DEVICE_LAYER | {"maps", "session", "signals", "sqn_jax"},
     "notebooks": RUN_LAYER | DEVICE_LAYER | {"maps", "sqn_jax"},
 }
 # env meets maps in one module: the one that makes EnvParams.

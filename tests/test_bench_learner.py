@@ -113,6 +113,7 @@ def test_pytorch_goes_the_same_way_in_several_updates(torch_sqn: Any) -> None:
         target_params=target_params,
         opt_state=optimizer.init(params),
         num_updates=jnp.int32(0),
+        num_skipped=jnp.int32(0),
     )
     config = TrainConfig(learner=LEARNER, replay=ReplayConfig(max_priority_weight=PRIORITY_WEIGHT))
     network = make_network("sqn", SIZES, ACTIONS)
@@ -160,7 +161,7 @@ def test_an_update_from_drawn_episodes_is_that_of_the_learner() -> None:
     )
     params = random_params(rng, "sqn", first)
     optimizer = make_optimizer(config.learner, 1)
-    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0))
+    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0), jnp.int32(0))
     given = {
         "network": make_network("sqn", SIZES, ACTIONS),
         "optimizer": optimizer,

@@ -227,6 +227,8 @@ def changed_everywhere() -> TrainConfig:
         updates_per_round=3,
         rounds_per_chunk=4,
         checkpoint_minutes=1.5,
+        checkpoint_replay=False,
+        max_skipped_updates=2,
         env=EnvConfig(
             **{
                 field.name: field.default * 1.5 + 0.01

@@ -24,6 +24,8 @@ METRICS = {
         "epsilon",
         "discount",
         "updates",
+        "skipped_updates",
+        "finite",
         "loss",
         "gradient_norm",
         "mean_q",
@@ -269,9 +271,11 @@ def test_reports_say_what_the_rounds_did(either: Trained) -> None:
         assert set(report.metrics) == set(rounds) == METRICS
         json.dumps(report.metrics)
         assert report.seconds > 0
-        for name in METRICS - {"updates"}:
+        for name in METRICS - {"updates", "skipped_updates", "finite"}:
             np.testing.assert_allclose(report.metrics[name], rounds[name].mean(axis=0), rtol=1e-6)
         assert report.metrics["updates"] == rounds["updates"][-1]
+        assert report.metrics["skipped_updates"] == 0
+        assert report.metrics["finite"] is True
         assert 0 <= report.metrics["success"] <= 1
         assert 1 <= report.metrics["time_steps"] <= config.env.max_steps
         assert len(report.metrics["skill_usage"]) == 2

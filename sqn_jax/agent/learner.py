@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -29,7 +30,9 @@ class LearnerState:
     opt_state: Any
     """Adam's moments and counter."""
     num_updates: Array
-    """int32."""
+    """int32, those left out included."""
+    num_skipped: Array
+    """int32: updates left out because their loss or gradient was not finite."""
 
 
 def discount_schedule(progress: Array, config: LearnerConfig) -> Array | float:
@@ -73,6 +76,7 @@ def init_learner(
         target_params=jax.tree.map(jnp.copy, params) if use_target else None,
         opt_state=optimizer.init(params),
         num_updates=jnp.int32(0),
+        num_skipped=jnp.int32(0),
     )
 
 
@@ -84,7 +88,9 @@ def gradient_step(
 ) -> tuple[LearnerState, LossOutput, dict[str, Array]]:
     """One step of the optimiser down a loss of the online parameters.
 
-    With the name of an axis of devices, down the mean of their losses: each takes the same step.
+    A step whose loss or gradient is not finite is left out and counted: one overflow, in one of
+    thousands of minibatches, would else end in parameters that are no numbers. With the name of an
+    axis of devices, down the mean of their losses: each takes the same step.
 
     Returns:
         The new state, the loss's by-products, and scalars worth logging.
@@ -98,13 +104,21 @@ def gradient_step(
     }
     gradient, told = mean((gradient, told), axis_name)
     updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+    norm = optax.tree.norm(gradient)
+    is_finite = jnp.isfinite(told["loss"]) & jnp.isfinite(norm)
+    params, opt_state = jax.tree.map(
+        partial(jnp.where, is_finite),
+        (optax.apply_updates(state.params, updates), opt_state),
+        (state.params, state.opt_state),
+    )
     new_state = dataclasses.replace(
         state,
-        params=optax.apply_updates(state.params, updates),
+        params=params,
         opt_state=opt_state,
         num_updates=state.num_updates + 1,
+        num_skipped=state.num_skipped + ~is_finite,
     )
-    return new_state, output, told | {"gradient_norm": optax.tree.norm(gradient)}
+    return new_state, output, told | {"gradient_norm": norm}
 
 
 def average_params(state: LearnerState, share: float) -> LearnerState:

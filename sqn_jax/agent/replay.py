@@ -132,8 +132,12 @@ def sample(
 
 
 def update_priorities(state: ReplayState, places: Array, priorities: Array) -> ReplayState:
-    """Set the priorities [B] of places [B]; of a place drawn twice, one of the two holds."""
-    priorities = jnp.maximum(priorities, 1e-6)
+    """Set the priorities [B] of places [B]; of a place drawn twice, one of the two holds.
+
+    A priority that is not finite leaves the place the one it has.
+    """
+    known = jnp.where(jnp.isfinite(priorities), priorities, state.priorities[places])
+    priorities = jnp.maximum(known, 1e-6)
     return dataclasses.replace(
         state,
         priorities=state.priorities.at[places].set(priorities),

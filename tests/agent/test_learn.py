@@ -59,6 +59,7 @@ def fresh_state(config: TrainConfig, seed: int, *, use_target: bool) -> LearnerS
         target_params=random_params(NETWORK, rng) if use_target else None,
         opt_state=optimizer_for(config).init(params),
         num_updates=jnp.int32(0),
+        num_skipped=jnp.int32(0),
     )
 
 

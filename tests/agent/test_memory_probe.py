@@ -75,7 +75,7 @@ def answers_after_training(algo: str, method: str, seed: int = 0) -> list[int]:
     optimizer = make_optimizer(config.learner, 2 * ROUNDS)
     example = random_round(jax.random.key(seed))
     params = random_params(network, np.random.default_rng(seed), example.obs)
-    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0))
+    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0), jnp.int32(0))
     block = example.actions.shape[1]
     memory = replay.init(r2d2.packed_item(example), config.replay.capacity, block)
     learn = r2d2.learn if method == "r2d2" else pqn.learn
