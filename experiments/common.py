@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from sqn_jax.checkpoint import NotSaved
 from sqn_jax.compare import Settings, load_maps, with_references
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.presets import PRESETS
 from sqn_jax.runlog import RunFolder
-from sqn_jax.session import Stopped, train_session
+from sqn_jax.session import train_session
+from sqn_jax.signals import Interrupted, interruptible, last_words, say_stopped
 
 ALGORITHMS: tuple[Algorithm, ...] = ("sqn", "r2d2", "dqn")
 
@@ -92,21 +94,21 @@ def _train(config: TrainConfig, folder: Path) -> None:
     if (folder / "summary.json").is_file():
         print(f"{folder} is trained")
         return
-    # A run that was killed before its first checkpoint is begun anew.
-    has_checkpoint = begun and any((folder / "checkpoints").glob("[0-9]*"))
-    if begun and not has_checkpoint:
-        (folder / "config.json").unlink()
-        (folder / "metrics.jsonl").unlink(missing_ok=True)
-    train_session(config, folder, resume=has_checkpoint)
+    train_session(config, folder, resume=begun)
 
 
 def run(main: Any) -> None:
     """Call an experiment's main; unusable input is one line and exit code 2."""
+    name = Path(sys.argv[0]).name
     try:
-        main()
+        with interruptible(name), last_words("the same command goes on from here"):
+            main()
     except (ValueError, OSError, json.JSONDecodeError) as error:
-        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except Stopped as stop:
-        print("saved; the same command goes on from here", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(1 if isinstance(error, NotSaved) else 2) from None
+    except FloatingPointError as error:  # Learning has diverged.
+        print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except Interrupted as stop:
+        say_stopped(stop.signal, name)
         raise SystemExit(stop.exit_code) from None

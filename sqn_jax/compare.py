@@ -197,7 +197,14 @@ def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
     """
     pools: dict[TrainConfig, list[Policy]] = {}
     for policy in policies:
-        same = dataclasses.replace(policy.config, seed=0, num_seeds=1, checkpoint_minutes=1.0)
+        same = dataclasses.replace(
+            policy.config,
+            seed=0,
+            num_seeds=1,
+            checkpoint_minutes=1.0,
+            checkpoint_replay=True,
+            max_skipped_updates=0,
+        )
         pools.setdefault(same, []).append(policy)
     algorithms = [config.algo for config in pools]
     agents = []

@@ -12,6 +12,8 @@ an update.
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -41,6 +43,43 @@ def use_cores() -> None:
         jax.config.update("jax_num_cpu_devices", num_cores())
     except RuntimeError:  # The devices are there already.
         return
+
+
+def require(kind: str | None) -> None:
+    """Choose the kind of device before JAX starts its devices, and see that there is one.
+
+    Args:
+        kind: "cpu", "gpu" or "tpu"; None takes what there is, an accelerator before the CPU.
+
+    Raises:
+        ValueError: there is none of this kind, or none that JAX was told to use.
+    """
+    if kind == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    try:
+        found = jax.devices()[0].platform
+    except RuntimeError as error:
+        told = " ".join(str(error).split())[:200]
+        raise ValueError(f"JAX finds no device as it is set up here ({told})") from None
+    if kind is not None and found != kind:
+        raise ValueError(f"--device is {kind}, expected one that JAX finds here: {found}")
+    if kind is None and found == "cpu" and not os.environ.get("JAX_PLATFORMS") and _has_nvidia():
+        print(
+            "there is an NVIDIA GPU, but this JAX cannot use it: running on the CPU "
+            "(pip install 'jax[cuda12]')",
+            file=sys.stderr,
+        )
+
+
+def _has_nvidia() -> bool:
+    return Path("/dev/nvidia0").exists()
+
+
+def words(mesh: Mesh | None = None) -> str:
+    """What computes: the kind of device, and how many of them."""
+    device = jax.devices()[0]
+    times = "" if mesh is None else f" x {mesh.size}"
+    return f"{device.platform} ({device.device_kind}){times}"
 
 
 def num_cores() -> int:

@@ -12,6 +12,7 @@ from sqn_jax.agent.networks import Params, initial_carry
 from sqn_jax.checkpoint import FOLDER, Checkpoints
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import Observation
+from sqn_jax.manifest import Origin
 from sqn_jax.runlog import RunFolder
 from sqn_jax.train import averages, network_of
 
@@ -51,17 +52,26 @@ def params_shapes(config: TrainConfig) -> Params:
     )
 
 
-def load_policy(run_dir: Path) -> Policy:
-    """Read the newest checkpoint of a run folder.
+def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
+    """Read a policy from a checkpoint of a run folder.
+
+    Args:
+        run_dir: the folder.
+        checkpoint: "newest", "best" (by success in training, over the chunks since the one before)
+            or the number of chunks it was saved after.
 
     Raises:
-        ValueError: it is no run folder, its config is unusable, or it holds no checkpoint.
+        ValueError: it is no run folder, its config is unusable, or it holds no such checkpoint, or
+            a damaged one.
+        Mismatch: the checkpoint is of another run than the config says.
     """
     _, config = RunFolder.open(run_dir)
     if not (run_dir / FOLDER).is_dir():
         raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
-    with Checkpoints(run_dir) as checkpoints:
-        params = checkpoints.restore_policy(params_shapes(config), averaged=averages(config))
+    with Checkpoints(run_dir, Origin(config)) as checkpoints:
+        params = checkpoints.restore_policy(
+            params_shapes(config), averaged=averages(config), which=checkpoint
+        )
     return Policy(run_dir.resolve().name, config, seeds_of(params, config))
 
 

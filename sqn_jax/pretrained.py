@@ -26,15 +26,21 @@ from sqn_jax.runlog import write_json
 PREFIX = "pretrained:"
 
 
-def find_policy(word: str) -> Policy:
+def find_policy(word: str, checkpoint: int | str = "newest") -> Policy:
     """A policy by the name a user gives: a run folder, or `pretrained:NAME`.
+
+    Args:
+        word: the name.
+        checkpoint: of a run, see `policies.load_policy`; other policies have but one.
 
     Raises:
         ValueError: there is none, or it is damaged.
     """
     if word.startswith(PREFIX):
+        if checkpoint != "newest":
+            raise ValueError(f"{word}: has no checkpoint {checkpoint}, expected newest")
         return load_pretrained(word.removeprefix(PREFIX))
-    return load_policy(Path(word))
+    return load_policy(Path(word), checkpoint)
 
 
 def pretrained_names() -> list[str]:

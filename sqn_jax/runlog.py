@@ -24,8 +24,16 @@ from sqn_jax.config import TrainConfig
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+SUMMARY = "summary.json"
 OWN_NAMES = ("config", "evaluation", "metrics", "summary")
 """Names of a run's own files, whatever they end in."""
+
+
+class NotWritten(OSError, ValueError):
+    """A file could not be written: the disk is full, say."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        super().__init__(f"{path}: cannot be written ({error.strerror or error})")
 
 
 class RunFolder:
@@ -51,7 +59,9 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             probe_writable(path)
-            _write_whole(path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
+            folder.write_config(config)
+        except NotWritten as error:
+            raise ValueError(f"run folder {path}: {error}") from None
         except OSError as error:
             raise ValueError(f"run folder {path}: cannot be written ({error.strerror})") from None
         return folder
@@ -67,10 +77,31 @@ class RunFolder:
             raise ValueError(f"run folder {path}: holds no run, expected a {CONFIG} in it")
         return cls(path), configs.load(path / CONFIG)
 
+    def write_config(self, config: TrainConfig) -> None:
+        """Write config.json as a whole or not at all."""
+        _write_whole(self.path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
+
+    def unfinish(self) -> None:
+        """Take away what says that the run is finished: it goes on."""
+        (self.path / SUMMARY).unlink(missing_ok=True)
+
     def append_metrics(self, row: Mapping[str, Any]) -> None:
-        """Add one line to metrics.jsonl; NaN becomes null."""
+        """Add one line to metrics.jsonl; NaN becomes null.
+
+        Raises:
+            NotWritten: the disk is full, say.
+        """
+        line = json.dumps(_without_nan(row), allow_nan=False) + "\n"
+        try:
+            with (self.path / METRICS).open("a", encoding="utf-8") as file:
+                file.write(line)
+        except OSError as error:
+            raise NotWritten(self.path / METRICS, error) from None
+
+    def flush_metrics(self) -> None:
+        """Let the rows so far survive a power cut."""
         with (self.path / METRICS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(_without_nan(row), allow_nan=False) + "\n")
+            flush_to_disk(file.fileno())
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The rows of metrics.jsonl; a half-written last line is left out.
@@ -97,6 +128,9 @@ class RunFolder:
 
     def keep_metrics(self, chunks: int) -> None:
         """Drop the rows past `chunks` chunks, which a resumed run will write again."""
+        path = self.path / METRICS
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{path}: expected a file")
         kept = [row for row in self.read_metrics() if row["chunk"] <= chunks]
         _write_whole(self.path / METRICS, "".join(json.dumps(row) + "\n" for row in kept))
 
@@ -113,6 +147,12 @@ def probe_writable(folder: Path) -> None:
     """Raise OSError where no file can be written."""
     with tempfile.TemporaryFile(dir=folder):
         pass
+
+
+def flush_to_disk(descriptor: int) -> None:
+    """Let what was written to a file survive a power cut, where the file system can do that."""
+    with suppress(OSError):
+        os.fsync(descriptor)
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -132,14 +172,14 @@ def written_whole(path: Path) -> Iterator[Path]:
     """A hidden name beside `path` to write to, which becomes `path` at the end or vanishes.
 
     Raises:
-        ValueError: the file cannot be written.
+        NotWritten: the file cannot be written.
     """
     partial = path.absolute().with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial
         partial.replace(path)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+        raise NotWritten(path, error) from None
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -147,8 +187,13 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 def _write_whole(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink()
+        raise NotWritten(path, error) from None
 
 
 def _without_nan(value: Any) -> Any:

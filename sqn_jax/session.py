@@ -5,61 +5,41 @@ The numbers come from `train` and `evaluate`; this module decides what is said a
 
 from __future__ import annotations
 
-import signal
-import sys
+import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
-from tqdm import tqdm
 
-import sqn_jax
-from sqn_jax import devices
+from sqn_jax import devices, divergence, finish, manifest, memory
 from sqn_jax.checkpoint import Checkpoints
-from sqn_jax.compare import (
-    Agent,
-    Driven,
-    Learnt,
-    Settings,
-    World,
-    evaluate_agents,
-    load_maps,
-    num_episodes,
-)
+from sqn_jax.compare import Agent, Settings, evaluate_agents, load_maps, num_episodes
 from sqn_jax.compilation import kept_programs, watched_compilation
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
-from sqn_jax.maps import OccupancyMap, load_map
-from sqn_jax.policies import Policy, seeds_of
+from sqn_jax.lock import locked
+from sqn_jax.manifest import Manifest, Origin
+from sqn_jax.maps import load_map
 from sqn_jax.progress import episodes_bar
-from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder, write_json, write_records
+from sqn_jax.signals import Interrupted, collected
 from sqn_jax.tensorboard import Board, require_tensorboard
 from sqn_jax.train import (
+    ChunkProgram,
     ChunkReport,
     RunnerState,
     compile_chunk,
     memory_bytes,
     num_windows,
-    policy_params,
     run,
     runner_shapes,
     start_run,
 )
-
-
-class Stopped(Exception):
-    """The run was stopped by a signal, after saving; carries the exit code."""
-
-    def __init__(self, signal_number: int) -> None:
-        super().__init__(signal_number)
-        self.exit_code = 128 + signal_number
 
 
 @kept_programs()
@@ -74,16 +54,20 @@ def train_session(
     """Train, evaluate and draw, telling the terminal about it.
 
     Args:
-        config: the settings; of a resumed run those in its folder.
+        config: the settings; of a resumed run those in its folder, with more episodes perhaps.
         run_dir: where everything goes.
-        resume: go on from the newest checkpoint in `run_dir`.
+        resume: go on from the newest sound checkpoint in `run_dir`; from the beginning if the run
+            was stopped before its first.
         num_devices: see `devices.choose`.
         tensorboard: write metrics and pictures for TensorBoard, too.
 
     Raises:
-        ValueError: the map, the folder or the number of devices is unusable, or tensorboardX is
-            asked for and not installed.
-        Stopped: by SIGINT or SIGTERM, after the chunk was finished and saved.
+        ValueError: the map, the folder or the number of devices is unusable, the run does not fit
+            into memory, or tensorboardX is asked for and not installed.
+        Mismatch: the checkpoints are of another run.
+        NotSaved: a checkpoint could not be written.
+        Diverged: the parameters are lost.
+        Interrupted: by SIGINT or SIGTERM; a chunk was finished and saved.
     """
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
@@ -91,31 +75,32 @@ def train_session(
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
     num_windows(config, env_params)
+    held = memory_bytes(config, env_params)
+    memory.require(held, "keeping its episodes", config.method)
     if tensorboard:
         require_tensorboard()
-    folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
-    _announce(config, env_params, run_dir, mesh)
-    with Checkpoints(run_dir) as checkpoints, ExitStack() as stack:
-        if resume:
-            shapes = runner_shapes(env_params, config, mesh)
-            runner, seconds_before = _restored(shapes, config, folder, checkpoints)
-        else:
-            runner, seconds_before = start_run(env_params, config, mesh), 0.0
-        done = int(np.max(np.asarray(runner.round))) * config.num_envs
+    origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
+    with ExitStack() as stack:
+        stack.enter_context(locked(run_dir))
+        folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
+        _announce(config, env_params, run_dir, mesh, held)
+        checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
+        runner = _restored(env_params, config, mesh, folder, checkpoints) if resume else None
+        done = 0 if runner is None else _rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        on_row = None if board is None else board.scalars
-        runner, timing = _train(
-            runner, env_params, config, folder, checkpoints, seconds_before, mesh, on_row
-        )
-        results, drawn = _evaluate(runner, occupancy_map, config, folder)
-        figures = _draw(drawn, occupancy_map, config, folder)
+        training = _Training(env_params, config, mesh, folder, checkpoints)
+        runner = training.drive(runner, None if board is None else board.scalars)
+        results, drawn = finish.evaluate(runner, occupancy_map, config, folder)
+        figures = finish.draw(drawn, occupancy_map, config, folder)
         if board is not None and figures:
             for path in sorted(folder.figures.glob("*.png")):
                 board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
-    _conclude(results, timing, figures, config, folder)
+    finish.conclude(results, training.timing, figures, config, folder)
 
 
-def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None) -> None:
+def _announce(
+    config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None, held: int
+) -> None:
     seeds = f"seed {config.seed}"
     if config.num_seeds > 1:
         seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
@@ -123,72 +108,156 @@ def _announce(config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: M
     print(
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
         f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
-        f"run folder {run_dir}, {_device_words(mesh)}, "
-        f"episodes in memory {memory_bytes(config, env_params) / 1e6:,.1f} MB"
+        f"run folder {run_dir}, device {devices.words(mesh)}, "
+        f"episodes in memory {held / 1e6:,.1f} MB"
     )
-
-
-def _device_words(mesh: Mesh | None) -> str:
-    device = jax.devices()[0]
-    times = "" if mesh is None else f" x {mesh.size}"
-    return f"device {device.platform} ({device.device_kind}){times}"
+    if config.method == "r2d2" and not config.checkpoint_replay:
+        print("checkpoints without the replay: a run that is stopped does not go on exactly")
 
 
 def _restored(
-    shapes: RunnerState, config: TrainConfig, folder: RunFolder, checkpoints: Checkpoints
-) -> tuple[RunnerState, float]:
-    """The state to go on from, and the seconds of training already behind it."""
-    runner = checkpoints.restore(shapes)
-    chunks = int(np.max(np.asarray(runner.round))) // config.rounds_per_chunk
-    folder.keep_metrics(chunks)
-    rows = folder.read_metrics()
-    print(f"resuming after {chunks} of {config.num_chunks} chunks")
-    return runner, float(rows[-1]["wall_seconds"]) if rows else 0.0
-
-
-def _train(
-    runner: RunnerState,
     env_params: EnvParams,
     config: TrainConfig,
+    mesh: Mesh | None,
     folder: RunFolder,
     checkpoints: Checkpoints,
-    seconds_before: float,
-    mesh: Mesh | None,
-    on_row: Callable[[dict[str, Any]], None] | None,
-) -> tuple[RunnerState, dict[str, float]]:
-    """Drive the training to its end; returns the final state and how long it took."""
-    episodes_a_chunk = config.rounds_per_chunk * config.num_envs
-    rounds_done = int(np.max(np.asarray(runner.round)))
-    steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
-    timing: dict[str, float] = {"train_seconds": seconds_before}
-    timing["env_steps"] = rounds_done * steps_a_round
-    timing["num_devices"] = 1 if mesh is None else mesh.size
-    print("compiling ...", end="", flush=True)
-    with watched_compilation() as was_read:
-        program, timing["compile_seconds"] = compile_chunk(env_params, config, mesh)
-    timing["compiled_earlier"] = was_read()
-    how = "compiled earlier, read" if was_read() else "compiled"
-    print(f"\r{how} in {timing['compile_seconds']:.1f} s")
-    last_saved = time.monotonic()
-    total = config.num_rounds * config.num_envs
-    with _signals() as received, episodes_bar(total, rounds_done * config.num_envs) as bar:
-        for runner, report in run(runner, env_params, config, program, mesh):  # noqa: B020
-            timing["train_seconds"] += report.seconds
-            timing["env_steps"] += config.rounds_per_chunk * steps_a_round
-            row = _row(report, timing["train_seconds"], env_params, config)
-            folder.append_metrics(row)
-            if on_row is not None:
-                on_row(row)
-            bar.set_postfix_str(_postfix(row), refresh=False)
-            bar.update(episodes_a_chunk)
-            if received or time.monotonic() - last_saved > 60 * config.checkpoint_minutes:
-                checkpoints.save(report.chunk, runner)
-                last_saved = time.monotonic()
-            if received:
-                raise Stopped(received[0])
-    if checkpoints.latest() != config.num_chunks:
-        checkpoints.save(config.num_chunks, runner)
-    return runner, timing
+) -> RunnerState | None:
+    """The state to go on from; None if the run was stopped before its first checkpoint.
+
+    From here on the folder is that of a run with this config, as far as it has come.
+    """
+    runner, chunks = None, 0
+    if checkpoints.chunks():
+        runner, told = checkpoints.restore(runner_shapes(env_params, config, mesh))
+        chunks = _rounds_done(runner) // config.rounds_per_chunk
+        if chunks > config.num_chunks:
+            episodes = chunks * config.rounds_per_chunk * config.num_envs
+            raise ValueError(
+                f"total_episodes is {config.total_episodes}, expected at least the {episodes} that "
+                f"the run in {folder.path} has behind it"
+            )
+        print(f"resuming after {chunks} of {config.num_chunks} chunks")
+        _compare_makes(told, mesh)
+        if config.method == "r2d2" and runner.memory is None:
+            print("saved without the replay: going on from an empty one, not exactly as before")
+            fresh = start_run(env_params, config, mesh)
+            runner = dataclasses.replace(runner, memory=fresh.memory)
+    else:
+        print("stopped before its first checkpoint: starting from the beginning")
+    folder.write_config(config)
+    folder.keep_metrics(chunks)
+    if chunks < config.num_chunks:
+        folder.unfinish()
+    rows = folder.read_metrics()
+    if [row["chunk"] for row in rows] != list(range(1, chunks + 1)):
+        warnings.warn(
+            f"{folder.path}: metrics.jsonl has {len(rows)} rows of {chunks} chunks", stacklevel=2
+        )
+    return runner
+
+
+def _compare_makes(told: Manifest, mesh: Mesh | None) -> None:
+    """Say so where another machine or version goes on: the run is then not the same to the bit."""
+    count = 1 if mesh is None else mesh.size
+    then = {**told.contents["versions"], "device": told.contents["device"]}
+    now = {**manifest.versions(), "device": devices.words()}
+    then["devices"], now["devices"] = str(told.contents["num_devices"]), str(count)
+    changed = [name for name in ("jax", "device", "devices", "sqn_jax") if then[name] != now[name]]
+    if changed:
+        was = ", ".join(f"{name} {then[name]}" for name in changed)
+        is_now = ", ".join(f"{name} {now[name]}" for name in changed)
+        print(f"saved under {was}; going on under {is_now}: not bit for bit as it would have been")
+
+
+class _Training:
+    """Drives a training to its end, with everything that is written on the way."""
+
+    def __init__(
+        self,
+        env_params: EnvParams,
+        config: TrainConfig,
+        mesh: Mesh | None,
+        folder: RunFolder,
+        checkpoints: Checkpoints,
+    ) -> None:
+        self._env_params, self._config, self._mesh = env_params, config, mesh
+        self._folder, self._checkpoints = folder, checkpoints
+        rows = folder.read_metrics()
+        self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
+        self.timing: dict[str, float] = {
+            "train_seconds": float(rows[-1]["wall_seconds"]) if rows else 0.0,
+            "env_steps": 0.0,
+            "num_devices": 1 if mesh is None else mesh.size,
+            "compile_seconds": 0.0,
+            "compiled_earlier": False,
+        }
+        self._successes: list[float] = []
+        self._saved_at = time.monotonic()
+
+    def drive(
+        self, runner: RunnerState | None, on_row: Callable[[dict[str, Any]], None] | None
+    ) -> RunnerState:
+        """From a state, or from the beginning, to the end; returns the final state."""
+        config = self._config
+        done = 0 if runner is None else _rounds_done(runner)
+        self.timing["env_steps"] = done * self._steps_a_round
+        if runner is not None and done >= config.num_rounds:
+            return runner
+        program = self._compile()
+        if runner is None:
+            runner = start_run(self._env_params, config, self._mesh)
+        total = config.num_rounds * config.num_envs
+        saving = "stopping after this chunk and saving"
+        with collected(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
+            for runner, report in run(runner, self._env_params, config, program, self._mesh):  # noqa: B020
+                row = self._keep(report)
+                if on_row is not None:
+                    on_row(row)
+                bar.set_postfix_str(_postfix(row), refresh=False)
+                bar.update(config.rounds_per_chunk * config.num_envs)
+                divergence.require_sound(row, runner.learner, config, self._folder)
+                is_due = time.monotonic() - self._saved_at > 60 * config.checkpoint_minutes
+                if received or is_due or report.chunk == config.num_chunks:
+                    self._save(report.chunk, runner)
+                if received:
+                    break
+        if received:
+            raise Interrupted(received[0])
+        return runner
+
+    def _compile(self) -> ChunkProgram:
+        """Compile, and refuse what does not fit."""
+        print("compiling ...", end="", flush=True)
+        with watched_compilation() as was_read:
+            program, seconds = compile_chunk(self._env_params, self._config, self._mesh)
+        self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
+        how = "compiled earlier, read" if was_read() else "compiled"
+        print(f"\r{how} in {seconds:.1f} s")
+        needed = memory.program_bytes(program)
+        memory.require(needed, "training", self._config.method)
+        return program
+
+    def _keep(self, report: ChunkReport) -> dict[str, Any]:
+        """Count a chunk and write its row."""
+        self.timing["train_seconds"] += report.seconds
+        self.timing["env_steps"] += self._config.rounds_per_chunk * self._steps_a_round
+        self._successes.append(float(np.mean(report.metrics["success"])))
+        row = _row(report, self.timing["train_seconds"], self._env_params, self._config)
+        self._folder.append_metrics(row)
+        return row
+
+    def _save(self, chunk: int, runner: RunnerState) -> None:
+        """Write a checkpoint, and what its rows say for good."""
+        self._folder.flush_metrics()
+        score = float(np.mean(self._successes))
+        light = not self._config.checkpoint_replay
+        self._checkpoints.save(chunk, runner, score=score, light=light)
+        self._successes.clear()
+        self._saved_at = time.monotonic()
+
+
+def _rounds_done(runner: RunnerState) -> int:
+    return int(np.max(np.asarray(runner.round)))
 
 
 @kept_programs()
@@ -239,133 +308,3 @@ def _postfix(row: dict[str, Any]) -> str:
         f"success {np.mean(row['success']):.2f}, reward {np.mean(row['mean_reward']):+.2f}, "
         f"{row['steps_per_second']:,} steps/s"
     )
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM instead of dying of them; a second one ends at once."""
-    received: list[int] = []
-
-    def note(number: int, _: FrameType | None) -> None:
-        received.append(number)
-        tqdm.write("\nstopping after this chunk; once more to stop at once", file=sys.stderr)
-        for each in previous:
-            signal.signal(each, signal.SIG_DFL)
-
-    previous = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for each, handler in previous.items():
-            signal.signal(each, handler)
-
-
-Drawn = dict[str, tuple[EpisodeSummary, Trace]]
-"""For each kind of task, the episodes of the first seed."""
-
-
-def _evaluate(
-    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
-) -> tuple[list[dict[str, Any]], Drawn]:
-    """Greedy episodes of every seed from the evaluation points and from random pairs."""
-    # On one device: every program that is given them would else run on each of the mesh.
-    params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
-    policy = Policy(folder.path.name, config, seeds_of(params, config))
-    settings = Settings(
-        maps=(config.map,),
-        tasks=("evaluation points", "random pairs"),
-        episodes=config.eval.episodes,
-        eval_seeds=1,
-        seed=config.eval.seed,
-        noise=((config.env.velocity_noise, config.env.range_noise),),
-        goal_radii=(config.env.goal_radius,),
-        max_steps=config.env.max_steps,
-    )
-    drawn: Drawn = {}
-
-    def keep(_: Agent, world: World, index: int, driven: Driven) -> None:
-        if index == 0:
-            drawn[world.tasks] = (driven[0][0], driven[1])
-
-    evaluation, records = evaluate_agents(
-        [Learnt(config.algo, (policy,))],
-        {(config.map, config.env.robot_radius): occupancy_map},
-        settings,
-        on_driven=keep,
-    )
-    folder.write_json("evaluation.json", evaluation)
-    folder.write_records("evaluation.jsonl", records)
-    return evaluation["results"], drawn
-
-
-def _draw(
-    drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
-) -> bool:
-    """Write the figures; says so and returns False where Matplotlib is not installed."""
-    try:
-        from sqn_jax import figures
-    except ImportError:
-        print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
-        return False
-    name = f"{config.algo.upper()} on {occupancy_map.name}"
-    curve = figures.learning_curve(folder.read_metrics(), title=name)
-    figures.save(curve, folder.figures / "learning_curve.png")
-    for tasks, (summary, trace) in drawn.items():
-        drawing = figures.trajectories(
-            occupancy_map,
-            trace.goals,
-            trace.poses,
-            trace.skill_weights,
-            summary.success,
-            summary.time_steps,
-            goal_radius=config.env.goal_radius,
-            robot_radius=config.env.robot_radius,
-            title=f"{name}, {tasks}" + (f", seed {config.seed}" if config.num_seeds > 1 else ""),
-        )
-        figures.save(drawing, folder.figures / f"trajectories_{tasks.replace(' ', '_')}.png")
-    return True
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.1f} s"
-
-
-def _conclude(
-    results: list[dict[str, Any]],
-    timing: dict[str, float],
-    figures: bool,
-    config: TrainConfig,
-    folder: RunFolder,
-) -> None:
-    """Write summary.json and say what it came to."""
-    device = jax.devices()[0]
-    summary: dict[str, Any] = {
-        "episodes": config.num_rounds * config.num_envs,
-        "wall_seconds": round(timing["train_seconds"], 1),
-        "compile_seconds": round(timing["compile_seconds"], 1),
-        "compiled_earlier": bool(timing["compiled_earlier"]),
-        "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
-        "device": f"{device.platform} ({device.device_kind})",
-        "num_devices": timing["num_devices"],
-        "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
-    }
-    print(
-        f"trained in {_duration(summary['wall_seconds'])} "
-        f"({summary['steps_per_second']:,} steps a second)"
-    )
-    for entry in results:
-        tasks = entry["tasks"]
-        summary[tasks.replace(" ", "_")] = {
-            "success": entry["success"]["mean"],
-            "time_steps": entry["time_steps"]["mean"],
-        }
-        low, high = entry["success"]["ci95"]
-        print(
-            f"{tasks + ':':19} success {entry['success']['mean']:.2f} "
-            f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
-            f"({config.eval.episodes} greedy episodes"
-            + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
-        )
-    folder.write_json("summary.json", summary)
-    if figures:
-        print(f"figures in {folder.figures}")

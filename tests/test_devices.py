@@ -20,6 +20,7 @@ from sqn_jax import devices, train
 from sqn_jax.agent import shares
 from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
+from sqn_jax.manifest import Origin
 from sqn_jax.policies import params_shapes
 from sqn_jax.presets import PRESETS
 
@@ -133,10 +134,10 @@ def test_a_run_saved_on_two_devices_goes_on_and_is_evaluated_on_one(
     config = config_for(method)
     world = small_room(LENGTH)
     runner = train.start_run(world, config, mesh)
-    with Checkpoints(tmp_path) as checkpoints:
+    with Checkpoints(tmp_path, Origin(config)) as checkpoints:
         checkpoints.save(1, runner)
-        alone = checkpoints.restore(train.runner_shapes(world, config, None))
-        again = checkpoints.restore(train.runner_shapes(world, config, mesh))
+        alone, _ = checkpoints.restore(train.runner_shapes(world, config, None))
+        again, _ = checkpoints.restore(train.runner_shapes(world, config, mesh))
         params = checkpoints.restore_policy(params_shapes(config), averaged=train.averages(config))
     for found, where in ((alone, 1), (again, 2)):
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(runner), strict=True):

@@ -25,6 +25,7 @@ from sqn_jax.cli import main
 from sqn_jax.compare import Learnt, Settings, World
 from sqn_jax.config import Algorithm, EnvConfig, TrainConfig
 from sqn_jax.env import make_env
+from sqn_jax.manifest import Origin
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies import Policy
 from sqn_jax.presets import PRESETS
@@ -337,7 +338,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
     folder = RunFolder.create(path, config)
     with compiling_quickly():
         runner = start_run(make_env(load_map(room_file), config.env), config)
-        with Checkpoints(path) as checkpoints:
+        with Checkpoints(path, Origin(config)) as checkpoints:
             checkpoints.save(1, runner)
         for chunk in (1, 2):
             usage = {"gate_entropy": 0.6 / chunk, "skill_usage": [0.5, 0.5]}
@@ -405,7 +406,7 @@ def test_one_run_has_its_curves_several_are_compared_and_one_without_metrics_has
 def test_folders_of_the_same_name_are_told_apart(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def found(word: str) -> Policy:
+    def found(word: str, _: int | str) -> Policy:
         return Policy(Path(word).name, TrainConfig(), ({},))
 
     monkeypatch.setattr("sqn_jax.report.content.find_policy", found)

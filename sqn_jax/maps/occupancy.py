@@ -7,8 +7,10 @@ frame turned by the origin's yaw and shifted by its x and y.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +59,18 @@ class OccupancyMap:
         """(width along x, height along y) in m."""
         rows, cols = self.shape
         return cols * self.resolution, rows * self.resolution
+
+    def identity(self) -> dict[str, Any]:
+        """What tells this map from another: its size, and a SHA-256 of all that decides a task."""
+        contents = hashlib.sha256(np.packbits(self.occupied).tobytes())
+        for numbers in (self.spawn_points, self.evaluation_points, [self.spawn_radius]):
+            contents.update(np.asarray(numbers, dtype="<f8").tobytes())
+        return {
+            "cells": list(self.shape),
+            "resolution": self.resolution,
+            "max_steps": self.max_steps,
+            "contents": contents.hexdigest()[:16],
+        }
 
     def to_map_frame(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points [..., 2] from the grid frame to the ROS map frame, in m."""
@@ -199,11 +213,13 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
     rows, cols = occupancy_map.shape
     found: list[tuple[str, int]] = []
     for name, point in _named_points(occupancy_map):
-        x, y = occupancy_map.to_map_frame(point)
+        # What overflows lies outside.
+        with np.errstate(over="ignore", invalid="ignore"):
+            x, y = occupancy_map.to_map_frame(point)
+            in_cells = np.floor(point[::-1] / occupancy_map.resolution)
         where = f"{source}: {name} ({x:g}, {y:g})"
         if not np.isfinite(point).all():
             raise ValueError(f"{where} is not finite, expected x, y in m")
-        in_cells = np.floor(point[::-1] / occupancy_map.resolution)
         if not ((in_cells >= 0) & (in_cells < (rows, cols))).all():
             raise ValueError(f"{where} lies outside the map, expected a point in free space")
         row, col = in_cells.astype(int)

@@ -61,15 +61,19 @@ class Content:
     """Three at most."""
 
 
-def read_runs(words: Sequence[str]) -> list[Run]:
+def read_runs(words: Sequence[str], checkpoint: int | str = "newest") -> list[Run]:
     """Runs by the names a user gives: folders, or `pretrained:NAME`.
 
     Folders of the same name in different places are called as the user does.
 
+    Args:
+        words: the names.
+        checkpoint: which of each run, see `policies.load_policy`.
+
     Raises:
         ValueError: one is not there, or damaged.
     """
-    runs = [_read_run(word) for word in words]
+    runs = [_read_run(word, checkpoint) for word in words]
     times = Counter(run.name for run in runs)
     return [
         replace(run, name=word, policy=replace(run.policy, name=word))
@@ -79,8 +83,8 @@ def read_runs(words: Sequence[str]) -> list[Run]:
     ]
 
 
-def _read_run(word: str) -> Run:
-    policy = find_policy(word)
+def _read_run(word: str, checkpoint: int | str) -> Run:
+    policy = find_policy(word, checkpoint)
     if word.startswith(PREFIX):
         return Run(word, policy, [], {})
     folder, _ = RunFolder.open(Path(word))

@@ -1,0 +1,89 @@
+"""`sqn evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqn_jax.cli.words import CACHE, TASKS, Parser, add_checkpoint, add_device
+from sqn_jax.presets import PAPER_MAPS
+
+
+def evaluate(words: list[str]) -> int:
+    """Compare policies."""
+    parser = Parser(
+        prog="sqn evaluate",
+        description="Drive greedy episodes of trained policies; every agent gets the same tasks.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME; none: references")
+    add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
+    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=5, help="how many evaluation seeds (default 5)")
+    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--velocity-noise", nargs="+", type=float, default=[], metavar="S", help="e.g. 0.1 0.2")
+    add("--range-noise", nargs="+", type=float, default=[], metavar="P", help="e.g. 0.2 0.4")
+    add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
+    add("--max-steps", type=int, default=0, help="steps an episode (default: as each map says)")
+    add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
+    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add_checkpoint(parser)
+    add_device(parser)
+    add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
+    options = parser.parse_args(words)
+    if not options.runs and options.no_references:
+        raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
+    from sqn_jax import compare, devices
+    from sqn_jax.pretrained import find_policy
+    from sqn_jax.scores import results_table
+    from sqn_jax.session import evaluate_session
+
+    devices.require(options.device)
+    noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
+    noise += [(0.0, level) for level in options.range_noise if level != 0]
+    settings = compare.Settings(
+        maps=tuple(options.maps),
+        tasks=tuple(TASKS[word] for word in options.tasks),
+        episodes=options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        noise=((0.0, 0.0), *noise),
+        noise_unit=options.noise_unit,
+        goal_radii=tuple(options.goal_radius),
+        max_steps=options.max_steps,
+    )
+    if options.out is not None:
+        _require_writable(options.out)
+    learnt = compare.group_policies(
+        [find_policy(word, options.checkpoint) for word in options.runs]
+    )
+    agents = compare.with_references(learnt, references=not options.no_references)
+    evaluation = evaluate_session(agents, settings, options.out)
+    print(results_table(evaluation["results"]))
+    for told in evaluation["comparisons"]:
+        low, high = told["ci95"]
+        print(
+            f"{told['first']} beats {told['second']} with probability "
+            f"{told['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
+        )
+    if options.out is not None:
+        print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
+    return 0
+
+
+def _require_writable(path: Path) -> None:
+    from sqn_jax.runlog import CONFIG, OWN_NAMES, probe_writable
+
+    if path.suffix != ".json":
+        raise ValueError(f"--out is {path}, expected a file ending in .json")
+    records = path.with_suffix(".jsonl")
+    if not path.parent.is_dir() or path.is_dir() or records.is_dir():
+        raise ValueError(f"--out {path}: expected a file in an existing folder")
+    if (path.parent / CONFIG).is_file() and path.stem in OWN_NAMES:
+        raise ValueError(f"--out {path}: is a file of that run itself, expected another name")
+    try:
+        probe_writable(path.parent)
+    except OSError as error:
+        raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,27 @@
+"""`sqn map`."""
+
+from __future__ import annotations
+
+from sqn_jax.cli.words import Parser
+
+
+def check_map(words: list[str]) -> int:
+    """Say what a map offers."""
+    parser = Parser(prog="sqn map", description="Look at maps.", allow_abbrev=False)
+    parser.add_argument("action", choices=["check"], help="check: report on a map")
+    parser.add_argument("file", help="a ROS map_server YAML file, or a map of the project by name")
+    parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
+    parser.add_argument(
+        "--allow-outside",
+        action="store_true",
+        help="let the YAML file name an image that lies outside its folder",
+    )
+    options = parser.parse_args(words)
+    from sqn_jax.maps import load_map
+    from sqn_jax.maps.check import describe
+
+    occupancy_map = load_map(
+        options.file, robot_radius=options.robot_radius, allow_outside=options.allow_outside
+    )
+    print(describe(occupancy_map, options.robot_radius))
+    return 0

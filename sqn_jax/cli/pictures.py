@@ -1,0 +1,111 @@
+"""`sqn report` and `sqn render`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqn_jax.cli.words import CACHE, TASKS, Parser, add_checkpoint, add_device, folder
+
+
+def report(words: list[str]) -> int:
+    """Write a page."""
+    parser = Parser(
+        prog="sqn report",
+        description="Drive greedy episodes of trained policies and write one page about them: "
+        "what went worst, success and time steps, curves, paths, an animation, settings.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("--maps", nargs="+", help="names or files (default: the map of the first run)")
+    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=1, help="how many evaluation seeds (default 1)")
+    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add_checkpoint(parser)
+    add_device(parser)
+    add("--out", type=Path, default=Path("report.html"), help="default: report.html")
+    options = parser.parse_args(words)
+    if not options.runs:
+        raise ValueError("nothing to report on: name a run folder or pretrained:NAME")
+    try:
+        from sqn_jax import report as pages
+    except ModuleNotFoundError as error:
+        if error.name != "matplotlib":
+            raise
+        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    from sqn_jax import devices
+    from sqn_jax.compare import Settings
+
+    devices.require(options.device)
+    pages.require_writable(options.out)
+    runs = pages.read_runs(options.runs, options.checkpoint)
+    config = runs[0].policy.config
+    settings = Settings(
+        maps=tuple(options.maps or [config.map]),
+        tasks=tuple(TASKS[word] for word in options.tasks),
+        episodes=options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        goal_radii=(config.env.goal_radius,),
+    )
+    pages.write_report(runs, settings, options.out, references=not options.no_references)
+    print(f"wrote {options.out}")
+    return 0
+
+
+def render(words: list[str]) -> int:
+    """Write pictures and films."""
+    parser = Parser(
+        prog="sqn render",
+        description="Drive greedy episodes of trained policies on a map and write what they did: "
+        "films (GIF), the paths of all side by side and timelines.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("--map", default="maze", help="a name or a file (default maze)")
+    add("--episodes", type=int, default=4, help="of each policy (default 4)")
+    add("--tasks", choices=list(TASKS), default="points", help="default: points")
+    add("--animations", type=int, default=1, help="films of each policy (default 1)")
+    add("--seed", type=int, default=1_000, help="the evaluation seed (default 1000)")
+    add("--velocity-noise", type=float, default=0.0, metavar="S", help="e.g. 0.1")
+    add("--range-noise", type=float, default=0.0, metavar="P", help="e.g. 0.2")
+    add("--max-steps", type=int, default=0, help="steps an episode (default: as the map says)")
+    add("--mp4", action="store_true", help="write films as MP4, too; needs sqn_jax[video]")
+    add_checkpoint(parser)
+    add_device(parser)
+    add("--out", type=folder, metavar="DIR", help="default: renders/NAME_MAP, NAME the run's")
+    options = parser.parse_args(words)
+    if not options.runs:
+        raise ValueError("nothing to render: name a run folder or pretrained:NAME")
+    from sqn_jax import devices
+    from sqn_jax.pretrained import find_policy
+
+    try:
+        from sqn_jax import render as pictures
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("matplotlib"):
+            raise
+        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    devices.require(options.device)
+    for word in options.runs:
+        if options.runs.count(word) > 1:
+            raise ValueError(f"{word}: comes twice, expected each run once")
+    policies = [find_policy(word, options.checkpoint) for word in options.runs]
+    pictures.render_session(
+        policies,
+        options.out or pictures.default_folder(policies, options.map),
+        map_name=options.map,
+        tasks=TASKS[options.tasks],
+        episodes=options.episodes,
+        animations=options.animations,
+        seed=options.seed,
+        noise=(options.velocity_noise, options.range_noise),
+        max_steps=options.max_steps,
+        mp4=options.mp4,
+    )
+    return 0

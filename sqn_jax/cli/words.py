@@ -1,0 +1,57 @@
+"""What the commands share: their parser, options that several have, checks of words."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Literal, NoReturn
+
+TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
+    "points": "evaluation points",
+    "pairs": "random pairs",
+}
+
+CACHE = (
+    "Compiled programs are kept in the user's cache folder for the next start: SQN_JAX_CACHE=DIR "
+    "in the environment names another folder, SQN_JAX_CACHE=off keeps none."
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports what is wrong as a ValueError, without the usage text."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what argparse would print."""
+        raise ValueError(message)
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """The option --device."""
+    parser.add_argument("--device", choices=["cpu", "gpu", "tpu"], help="default: what there is")
+
+
+def add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    """The option --checkpoint."""
+    parser.add_argument(
+        "--checkpoint",
+        type=checkpoint,
+        default="newest",
+        metavar="WHICH",
+        help="of a run: newest (default), best (in training) or the number of its chunks",
+    )
+
+
+def checkpoint(word: str) -> int | str:
+    """Which checkpoint of a run."""
+    if word in ("newest", "best"):
+        return word
+    if word.isascii() and word.isdigit():
+        return int(word)
+    raise argparse.ArgumentTypeError(f"is {word}, expected newest, best or a number")
+
+
+def folder(word: str) -> Path:
+    """The name of a folder."""
+    if not word.strip():
+        raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
+    return Path(word)

@@ -1,0 +1,81 @@
+"""Whether a run fits, asked before it allocates anything."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import jax
+
+KNOBS = {
+    "r2d2": ("replay.capacity", "num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
+    "pqn": ("num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
+}
+"""Settings that decide how much a run takes, the strongest first."""
+
+
+def require(num_bytes: float, what: str, method: str) -> None:
+    """Refuse what is more than there is.
+
+    Args:
+        num_bytes: that will be allocated.
+        what: for, in words.
+        method: of the run, whose settings are named.
+
+    Raises:
+        ValueError: it does not fit.
+    """
+    free = available_bytes()
+    if free is not None and num_bytes > free:
+        knobs = ", ".join(f"--{name.replace('_', '-')}" for name in KNOBS[method])
+        raise ValueError(
+            f"{what} would take {num_bytes / 1e9:,.1f} GB, but {free / 1e9:,.1f} GB are free on "
+            f"{jax.devices()[0].device_kind}: lower one of {knobs}"
+        )
+
+
+def program_bytes(program: Any) -> float:
+    """What a compiled program takes while it runs: arguments, results and all in between."""
+    told = program.memory_analysis()
+    if told is None:  # Some backends do not say.
+        return 0.0
+    return float(
+        told.argument_size_in_bytes
+        + told.output_size_in_bytes
+        + told.temp_size_in_bytes
+        - told.alias_size_in_bytes
+    )
+
+
+def available_bytes() -> float | None:
+    """Bytes that can still be allocated where a run would be; None where nobody knows."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        told = device.memory_stats() or {}
+        if "bytes_limit" not in told:
+            return None
+        return float(told["bytes_limit"] - told.get("bytes_in_use", 0))
+    found = [free for free in (_free_of_machine(), _free_of_group()) if free is not None]
+    return min(found) if found else None
+
+
+def _free_of_machine() -> float | None:
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * float(line.split()[1])
+    with suppress(OSError, ValueError):
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return None
+
+
+def _free_of_group() -> float | None:
+    """What a container may still use (control groups, version 2)."""
+    group = Path("/sys/fs/cgroup")
+    with suppress(OSError, ValueError):
+        most = float((group / "memory.max").read_text(encoding="ascii"))  # "max": no limit.
+        used = float((group / "memory.current").read_text(encoding="ascii"))
+        return most - used
+    return None
