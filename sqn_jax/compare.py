@@ -248,6 +248,8 @@ def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
     }
     called: dict[str, str] = {}
     for (name, _), occupancy_map in maps.items():
+        if occupancy_map.tiles != (1, 1):
+            raise ValueError(f"map {name}: several, expected one for an evaluation")
         if called.setdefault(occupancy_map.name, name) != name:
             raise ValueError(
                 f"maps {called[occupancy_map.name]} and {name}: both are called "

@@ -259,7 +259,8 @@ class TrainConfig:
     method: Method = "r2d2"
     """How it learns: R2D2 with replay, or recurrent PQN on fresh episodes."""
     map: str = "maze"
-    """A map of the project by name, or the path of a ROS map_server YAML file."""
+    """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
+    ("maze:7"), or several side by side, "maze,maze:0-14"; evaluated is the first."""
     seed: int = 0
     """Seed of the first run."""
     num_seeds: int = 1

@@ -10,7 +10,7 @@ import sqn_jax
 from sqn_jax import devices
 from sqn_jax.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
 from sqn_jax.config import TrainConfig
-from sqn_jax.maps import OccupancyMap
+from sqn_jax.maps import OccupancyMap, split_names
 from sqn_jax.policies import Policy, seeds_of
 from sqn_jax.rollout import EpisodeSummary, Trace
 from sqn_jax.runlog import RunFolder
@@ -23,12 +23,20 @@ Drawn = dict[str, tuple[EpisodeSummary, Trace]]
 def evaluate(
     runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> tuple[list[dict[str, Any]], Drawn]:
-    """Greedy episodes of every seed from the evaluation points and from random pairs."""
+    """Greedy episodes of every seed from the evaluation points and from random pairs.
+
+    Args:
+        runner: the final state.
+        occupancy_map: the first map of the run.
+        config: of the run.
+        folder: of the run.
+    """
+    name = split_names(config.map)[0]
     # On one device: every program that is given them would else run on each of the mesh.
     params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
     policy = Policy(folder.path.name, config, seeds_of(params, config))
     settings = Settings(
-        maps=(config.map,),
+        maps=(name,),
         tasks=("evaluation points", "random pairs"),
         episodes=config.eval.episodes,
         eval_seeds=1,
@@ -45,7 +53,7 @@ def evaluate(
 
     evaluation, records = evaluate_agents(
         [Learnt(config.algo, (policy,))],
-        {(config.map, config.env.robot_radius): occupancy_map},
+        {(name, config.env.robot_radius): occupancy_map},
         settings,
         on_driven=keep,
     )

@@ -24,7 +24,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.lock import locked
 from sqn_jax.manifest import Manifest, Origin
-from sqn_jax.maps import load_map
+from sqn_jax.maps import load_map, split_names
 from sqn_jax.progress import episodes_bar
 from sqn_jax.runlog import RunFolder, write_json, write_records
 from sqn_jax.signals import Interrupted, collected
@@ -90,6 +90,9 @@ def train_session(
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
         training = _Training(env_params, config, mesh, folder, checkpoints)
         runner = training.drive(runner, None if board is None else board.scalars)
+        if occupancy_map.tiles != (1, 1):
+            first = split_names(config.map)[0]
+            occupancy_map = load_map(first, robot_radius=config.env.robot_radius)
         results, drawn = finish.evaluate(runner, occupancy_map, config, folder)
         figures = finish.draw(drawn, occupancy_map, config, folder)
         if board is not None and figures:

@@ -54,7 +54,7 @@ def kill_at_random_times(runs: TinyRuns, kills: int, seed: int) -> list[int]:
 
 
 def assert_kills_leave_no_trace(runs: TinyRuns, kills: int, seed: int) -> None:
-    runs.finish("straight")
+    runs.finish("straight", "--checkpoint-minutes", "10")
     found = kill_at_random_times(runs, kills, seed)
     told = runs.finish("killed", resume=True)
     assert "resuming after" in told
@@ -85,7 +85,7 @@ def test_a_run_killed_twice_while_it_saves_ends_in_the_same_bits(tiny: TinyRuns)
 @pytest.mark.parametrize("method", ["pqn", "r2d2"])
 def test_a_run_killed_thirty_times_ends_in_the_same_bits(tmp_path: Path, method: str) -> None:
     more = {"replay__capacity": "16", "replay__min_episodes": "8", "updates_per_round": "2"}
-    runs = TinyRuns(tmp_path, chunks=400, method=method, **more)
+    runs = TinyRuns(tmp_path, chunks=200, method=method, **more)
     assert_kills_leave_no_trace(runs, kills=30, seed=2)
 
 
@@ -141,6 +141,7 @@ def test_a_signal_in_the_evaluation_leaves_a_trained_run_to_be_evaluated(
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_at_a_random_time_and_a_resumed_run_is_the_same(
     tmp_path: Path, number: signal.Signals

@@ -52,12 +52,13 @@ class TinyRuns:
 
     def words(self, run: str, *more: str, resume: bool = False) -> list[str]:
         """The command line of a new run or of one to go on with."""
-        told = ["--run-dir", str(self.folder / run), *more]
+        told = ["--run-dir", str(self.folder / run)]
         if resume:
             told += ["--resume", "--num-devices", "1"]
         else:
             for name, value in self.options.items():
                 told += [f"--{name}", value] if value else [f"--{name}"]
+        told += more
         return ["train", *told]
 
     def start(self, run: str, *more: str, resume: bool = False) -> subprocess.Popen[str]:
@@ -83,10 +84,10 @@ class TinyRuns:
             code = main(self.words(run, *more, resume=resume))
         return code, out.getvalue(), err.getvalue()
 
-    def finish(self, run: str, *, resume: bool = False) -> str:
+    def finish(self, run: str, *more: str, resume: bool = False) -> str:
         """Run to the end in a process of its own; what it said."""
-        with self.start(run, resume=resume) as process:
-            out, err = process.communicate(timeout=200)
+        with self.start(run, *more, resume=resume) as process:
+            out, err = process.communicate(timeout=600)
         assert process.returncode == 0, err
         assert "Traceback" not in err
         return out + err

@@ -36,6 +36,7 @@ def evaluate(words: list[str]) -> int:
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax import compare, devices
+    from sqn_jax.maps import split_names
     from sqn_jax.pretrained import find_policy
     from sqn_jax.scores import results_table
     from sqn_jax.session import evaluate_session
@@ -44,7 +45,7 @@ def evaluate(words: list[str]) -> int:
     noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
     noise += [(0.0, level) for level in options.range_noise if level != 0]
     settings = compare.Settings(
-        maps=tuple(options.maps),
+        maps=tuple(name for word in options.maps for name in split_names(word)),
         tasks=tuple(TASKS[word] for word in options.tasks),
         episodes=options.episodes,
         eval_seeds=options.eval_seeds,

@@ -17,11 +17,12 @@ def check_map(words: list[str]) -> int:
         help="let the YAML file name an image that lies outside its folder",
     )
     options = parser.parse_args(words)
-    from sqn_jax.maps import load_map
+    from sqn_jax.maps import load_map, split_names
     from sqn_jax.maps.check import describe
 
-    occupancy_map = load_map(
-        options.file, robot_radius=options.robot_radius, allow_outside=options.allow_outside
-    )
-    print(describe(occupancy_map, options.robot_radius))
+    for number, name in enumerate(split_names(options.file)):
+        occupancy_map = load_map(
+            name, robot_radius=options.robot_radius, allow_outside=options.allow_outside
+        )
+        print("\n" * (number > 0) + describe(occupancy_map, options.robot_radius))
     return 0

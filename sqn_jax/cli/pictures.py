@@ -38,13 +38,15 @@ def report(words: list[str]) -> int:
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
     from sqn_jax import devices
     from sqn_jax.compare import Settings
+    from sqn_jax.maps import split_names
 
     devices.require(options.device)
     pages.require_writable(options.out)
     runs = pages.read_runs(options.runs, options.checkpoint)
     config = runs[0].policy.config
+    maps = options.maps or split_names(config.map)[:1]
     settings = Settings(
-        maps=tuple(options.maps or [config.map]),
+        maps=tuple(name for word in maps for name in split_names(word)),
         tasks=tuple(TASKS[word] for word in options.tasks),
         episodes=options.episodes,
         eval_seeds=options.eval_seeds,

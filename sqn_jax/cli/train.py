@@ -105,7 +105,8 @@ def _condense(box: str) -> str:
 
 def _default_run_dir(config: TrainConfig, preset: str) -> Path:
     stamp = time.strftime("%Y-%m-%d_%H%M%S")
-    return Path("runs") / f"{stamp}_{config.algo}_{Path(config.map).stem}_{preset}"
+    name = re.sub(r"[^A-Za-z0-9-]+", "_", Path(config.map).stem)[:40]
+    return Path("runs") / f"{stamp}_{config.algo}_{name}_{preset}"
 
 
 def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -> int:
@@ -129,7 +130,14 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
 
 def _with_absolute_map(config: TrainConfig) -> TrainConfig:
     """A map file stays findable when the run is resumed from another folder."""
-    path = Path(config.map)
-    if path.suffix and path.exists():
-        return dataclasses.replace(config, map=str(path.resolve()))
-    return config
+    from sqn_jax.maps import split_names
+
+    names = split_names(config.map)
+    paths = [Path(name) for name in names]
+    if not any(path.suffix and path.exists() for path in paths):
+        return config
+    found = [
+        str(path.resolve()) if path.suffix and path.exists() else name
+        for name, path in zip(names, paths, strict=True)
+    ]
+    return dataclasses.replace(config, map=",".join(found))

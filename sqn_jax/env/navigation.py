@@ -39,17 +39,19 @@ Info = dict[str, Array]
 def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A).
 
-    A share of the tasks, none by default, has its goal near one of the closest spawn points.
+    Of a map that holds several, both lie in the same. A share of the tasks, none by default, has
+    its goal near one of the closest spawn points.
     """
     keys = jax.random.split(key, 7)
     start_key, goal_key, start_place_key, goal_place_key, heading_key, near_key, which_key = keys
-    num_points = params.spawn_counts.shape[0]
-    start_point = jax.random.randint(start_key, (), 0, num_points)
-    other = jax.random.randint(goal_key, (), 1, num_points)
+    start_point = jax.random.randint(start_key, (), 0, params.spawn_counts.shape[0])
+    first, group_size = params.spawn_groups[start_point]
+    other = jax.random.randint(goal_key, (), 1, group_size)
     neighbors = params.spawn_neighbors[start_point]
     neighbor = neighbors[jax.random.randint(which_key, (), 0, neighbors.shape[0])]
     near = jax.random.uniform(near_key) < params.near_goal_fraction
-    goal_point = jnp.where(near, neighbor, (start_point + other) % num_points)
+    anyone = first + (start_point - first + other) % group_size
+    goal_point = jnp.where(near, neighbor, anyone)
     start = _place_near(start_place_key, start_point, params)
     heading = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
     return jnp.append(start, heading), _place_near(goal_place_key, goal_point, params)
@@ -170,6 +172,8 @@ def field_of_view(params: EnvParams) -> float:
 
 
 def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> tuple[Array, Array]:
+    if params.tile is not None:
+        pose = pose.at[:2].set(pose[:2] % jnp.asarray(params.tile, pose.dtype))
     return coverage.add_scan(
         covered, pose, ranges, field_of_view=field_of_view(params), lattice=params.lattice
     )

@@ -26,6 +26,9 @@ class EnvParams:
     """[S, M, 2] m: places to start or finish, grouped by spawn point, padded by repetition."""
     spawn_counts: Array
     """[S] int32: how many of the M places of a spawn point are real."""
+    spawn_groups: Array
+    """[S, 2] int32: of the spawn points that reach each other the first, and how many they are; all
+    of them, unless the map holds several side by side."""
     spawn_neighbors: Array
     """[S, M'] int32: the spawn points nearest to each, for tasks with a near goal."""
     near_goal_fraction: Array
@@ -49,7 +52,9 @@ class EnvParams:
     max_steps: int = struct.field(pytree_node=False)
     """Steps an episode."""
     lattice: Lattice = struct.field(pytree_node=False)
-    """The points on which the covered area is counted."""
+    """The points on which the covered area is counted, of one tile."""
+    tile: tuple[float, float] | None = struct.field(pytree_node=False)
+    """Width and height of the tiles of a map that holds several, m."""
 
 
 @struct.dataclass

@@ -70,7 +70,9 @@ def make_env(
     body_free = traversable(occupancy_map.occupied, occupancy_map.resolution, config.robot_radius)
     positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
-    height_m, width_m = (side * occupancy_map.resolution for side in occupancy_map.occupied.shape)
+    width_m, height_m = occupancy_map.tile_m
+    middles = positions.mean(axis=1)
+    groups = _groups(occupancy_map.tile_of(middles))
     return EnvParams(
         sight=_ray_grid(
             occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
@@ -78,7 +80,8 @@ def make_env(
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
-        spawn_neighbors=jnp.asarray(_nearest(positions.mean(axis=1)), jnp.int32),
+        spawn_groups=jnp.asarray(groups, jnp.int32),
+        spawn_neighbors=jnp.asarray(_nearest(middles, groups), jnp.int32),
         near_goal_fraction=jnp.float32(config.near_goal_fraction),
         commands=jnp.array(
             [
@@ -100,6 +103,7 @@ def make_env(
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
+        tile=None if occupancy_map.tiles == (1, 1) else (width_m, height_m),
     )
 
 
@@ -156,11 +160,27 @@ def _ray_grid(
     )
 
 
-def _nearest(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each point [S, 2] the indices of the nearest others [S, up to NUM_NEIGHBORS]."""
+def _groups(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each point, given by its tile [S], the first of its tile and how many these are, [S, 2].
+
+    Points of a tile stand one after the other.
+    """
+    _, firsts, own, counts = np.unique(
+        tiles, return_index=True, return_inverse=True, return_counts=True
+    )
+    return np.stack([firsts[own], counts[own]], axis=1)
+
+
+def _nearest(points: NDArray[np.float64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each point [S, 2] the indices of the nearest others of its group [S, NUM_NEIGHBORS].
+
+    Fewer, where a group has no more points.
+    """
     distances = np.hypot(*np.moveaxis(points[:, None] - points[None], -1, 0))
     np.fill_diagonal(distances, np.inf)
-    return np.argsort(distances, axis=1, kind="stable")[:, : min(NUM_NEIGHBORS, len(points) - 1)]
+    distances[groups[:, None, 0] != groups[None, :, 0]] = np.inf
+    count = min(NUM_NEIGHBORS, groups[:, 1].min() - 1)
+    return np.argsort(distances, axis=1, kind="stable")[:, :count]
 
 
 def _spawn_positions(
@@ -182,13 +202,13 @@ def _spawn_positions(
         free = body_free[rows, columns]
         return np.where(free[:, None], marked, own_centres)[:, None], np.ones(len(marked), np.int64)
     groups = []
-    rows, columns = np.nonzero(body_free)
-    centres = (np.stack([columns, rows], axis=1) + 0.5) * resolution
+    reach = math.ceil(occupancy_map.spawn_radius / resolution)
     for point in occupancy_map.spawn_points:
         row, column = points_to_cells(point, resolution)
-        near = np.hypot(*(centres - point).T) <= occupancy_map.spawn_radius
-        same = labels[rows, columns] == labels[row, column]
-        group = centres[near & same]
+        corner = np.maximum([row - reach, column - reach], 0)
+        around = labels[corner[0] : row + reach + 1, corner[1] : column + reach + 1]
+        centres = cells_to_points(np.argwhere(around == labels[row, column]) + corner, resolution)
+        group = centres[np.hypot(*(centres - point).T) <= occupancy_map.spawn_radius]
         own_cell = cells_to_points([row, column], resolution)[None]
         groups.append(group if len(group) else own_cell)
     counts = np.array([len(group) for group in groups])

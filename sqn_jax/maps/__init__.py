@@ -2,6 +2,7 @@
 
 from sqn_jax.maps.check import describe
 from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
+from sqn_jax.maps.names import load_map, split_names
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -12,7 +13,7 @@ from sqn_jax.maps.occupancy import (
     traversable,
     validate,
 )
-from sqn_jax.maps.ros import known_maps, load_map, save_map
+from sqn_jax.maps.ros import known_maps, save_map
 
 __all__ = [
     "OccupancyMap",
@@ -28,6 +29,7 @@ __all__ = [
     "reachable_cells",
     "sample_spawn_points",
     "save_map",
+    "split_names",
     "traversable",
     "validate",
 ]

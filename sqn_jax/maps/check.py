@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.distance import goal_distance
+from sqn_jax.maps.distance import goal_fields
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     connected_components,
@@ -27,9 +27,11 @@ def evaluation_distances(
     points = occupancy_map.evaluation_points
     free = reachable_cells(occupancy_map, robot_radius)
     row, col = points_to_cells(points, occupancy_map.resolution).T
-    geodesic = goal_distance(free, occupancy_map.resolution, points)[:, row, col].T
+    geodesic = np.empty((len(points), len(points)))
+    for goals, field in goal_fields(free, occupancy_map.resolution, points):
+        geodesic[:, goals] = field[row, col][:, None]
     straight = np.linalg.norm(points[:, None] - points[None, :], axis=-1)
-    return geodesic.astype(np.float64), straight
+    return geodesic, straight
 
 
 def describe(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from sqn_jax.maps.files import one_line
+
 MAX_PIXELS = 64 * 2**20
 MAX_IMAGE_BYTES = 512 * 2**20
 MODES = ("trinary", "scale", "raw")
+_TEXT_KINDS = (b"P1", b"P2", b"P3")
 # See `suspicious_level`.
 _UNKNOWN_GREY = 205  # of 255
 _NEAR_THRESHOLD = 0.1
@@ -56,9 +60,14 @@ def read_pixels(path: Path, mode: str) -> GreyImage:
     Raises:
       ValueError: one line, without the file's name: not an image, too large, damaged.
     """
-    data = path.read_bytes() if path.stat().st_size <= MAX_IMAGE_BYTES else b""
-    if not data:
-        raise ValueError(f"expected 1 to {MAX_IMAGE_BYTES} bytes, got {path.stat().st_size}")
+    size = path.stat().st_size
+    if not 1 <= size <= MAX_IMAGE_BYTES:
+        raise ValueError(f"expected 1 to {MAX_IMAGE_BYTES} bytes, got {size}")
+    with path.open("rb") as file:
+        data = file.read(size)
+    if data[:2] in _TEXT_KINDS:
+        # The decoder copies a megabyte for every comment: minutes for a file made of them.
+        data = re.sub(rb"#[^\r\n]*", b"", data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -71,19 +80,22 @@ def read_pixels(path: Path, mode: str) -> GreyImage:
             raise ValueError("contents of another kind, expected a PNG or PGM image") from error
         # Pillow's decoders raise a dozen kinds of error on damaged files: each means unusable.
         except Exception as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(f"{reason}, expected a readable PNG or PGM image") from error
+            raise ValueError(f"{one_line(error)}, expected a readable PNG or PGM image") from error
 
 
 def _to_grey(image: Image.Image, mode: str) -> GreyImage:
     """Pixels of an open image of any supported kind."""
-    if image.mode in ("P", "PA"):
-        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    elif image.mode == "1":
-        image = image.convert("L")
+    # A palette's transparency is an alpha channel like any other; a single grey or colour marked as
+    # clear is none, but makes its pixels unknown where opacity counts.
+    clear = image.info.get("transparency")
     if image.mode in ("I", "I;16", "I;16B", "I;16L"):
         # 16 bits: read as numbers, since a conversion to 8 bits would clip at 255.
-        return GreyImage(np.asarray(image).astype(np.int64).clip(0, 65535), 65535, None)
+        grey = np.asarray(image).astype(np.int64).clip(0, 65535)
+        return GreyImage(grey, 65535, None if clear is None else grey != clear)
+    if image.mode in ("P", "RGB", "L", "1"):
+        channels = "RGB" if image.mode in ("P", "RGB") else "L"
+        has_alpha = clear is not None and (image.mode == "P" or mode == "scale")
+        image = image.convert(channels + "A" if has_alpha else channels)
     if image.mode not in ("L", "LA", "RGB", "RGBA"):
         raise ValueError(f"pixel type {image.mode!r}, expected grey, colour or palette")
     pixels = np.asarray(image)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sqn_jax.maps.files import named, read_at_most
 from sqn_jax.maps.image import MAX_PIXELS
 from sqn_jax.maps.occupancy import (
     EVALUATION_COUNT,
@@ -31,38 +34,58 @@ def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -
     Raises:
       ValueError: one line naming the file, the field and what was expected.
     """
-    try:
-        if not path.is_file():
-            raise ValueError(f"{path}: no such file, expected a MovingAI map")
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError(f"{path}: larger than {_MAX_BYTES} bytes, expected a MovingAI map")
-        lines = path.read_bytes().splitlines()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+    data = read_at_most(path, _MAX_BYTES, "a MovingAI map")
+    # One byte a line end, whatever the file has, so that row r begins at r * (width + 1). The body
+    # is not split: a file of the largest size may have more lines than there is memory for.
+    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    *lines, body = [*data.split(b"\n", 4), b"", b"", b"", b""][:5]
     header = {}
     for number, line in enumerate(lines[:3]):
-        words = line.split()
+        words = line.split(None, 2)
         if len(words) != 2:
-            raise ValueError(f"{path}: line {number + 1}: expected a key and a value")
+            raise ValueError(
+                f"{named(path)}: header: line {number + 1}: expected a key and a value"
+            )
         header[words[0]] = words[1]
-    if header.get(b"type") != b"octile" or [line.strip() for line in lines[3:4]] != [b"map"]:
-        raise ValueError(f"{path}: header: expected type octile, height, width, map")
-    size = {}
-    for key in ("height", "width"):
-        text = header.get(key.encode(), b"")
-        if not (text.isdigit() and len(text) < 9 and int(text) > 0):
-            raise ValueError(f"{path}: {key}: {text[:20]!r}, expected a whole number above 0")
-        size[key] = int(text)
-    rows = lines[4 : 4 + size["height"]]
-    if len(rows) < size["height"] or any(len(row) != size["width"] for row in rows):
-        raise ValueError(f"{path}: map: expected {size['height']} lines of {size['width']} letters")
-    letters = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), size["width"])
-    free = np.isin(letters, np.frombuffer(_FREE, dtype=np.uint8))
-    if not (free | np.isin(letters, np.frombuffer(_BLOCKED, dtype=np.uint8))).all():
-        raise ValueError(f"{path}: map: unknown letter, expected {(_FREE + _BLOCKED).decode()}")
+    if header.get(b"type") != b"octile" or lines[3].strip() != b"map":
+        raise ValueError(f"{named(path)}: header: expected type octile, height, width, map")
+    rows, cols = (_side(path, key, header) for key in ("height", "width"))
+    if rows * cols > MAX_PIXELS:
+        raise ValueError(
+            f"{named(path)}: height, width: {rows} x {cols} cells, expected at most {MAX_PIXELS}"
+        )
+    free = _free_cells(path, body, rows, cols)
     occupied = close_border(~free[::-1])
     try:
         points = sample_spawn_points(occupied, resolution, robot_radius)
     except ValueError as error:
-        raise ValueError(f"{path}: map: {error}") from error
+        raise ValueError(f"{named(path)}: map: {error}") from error
     return OccupancyMap(path.stem, occupied, resolution, points, points[:EVALUATION_COUNT])
+
+
+def _side(path: Path, key: str, header: Mapping[bytes, bytes]) -> int:
+    """The height or the width, in cells."""
+    text = header.get(key.encode(), b"")
+    if not (text.isdigit() and len(text) < 9 and int(text) > 0):
+        raise ValueError(f"{named(path)}: {key}: {text[:20]!r}, expected a whole number above 0")
+    return int(text)
+
+
+def _free_cells(path: Path, body: bytes, rows: int, cols: int) -> NDArray[np.bool_]:
+    """The letters as free cells [rows, cols], the first line first; what follows is left out."""
+    wrong = ValueError(f"{named(path)}: map: expected {rows} lines of {cols} letters")
+    body = body[: rows * (cols + 1)]
+    if len(body) == rows * (cols + 1) - 1:  # The last line need not end.
+        body += b"\n"
+    if len(body) != rows * (cols + 1):
+        raise wrong
+    letters = np.frombuffer(body, dtype=np.uint8).reshape(rows, cols + 1)
+    ends = letters == ord("\n")
+    if ends[:, :-1].any() or not ends[:, -1].all():
+        raise wrong
+    letters = letters[:, :-1]
+    free = np.isin(letters, np.frombuffer(_FREE, dtype=np.uint8))
+    if not (free | np.isin(letters, np.frombuffer(_BLOCKED, dtype=np.uint8))).all():
+        known = (_FREE + _BLOCKED).decode()
+        raise ValueError(f"{named(path)}: map: unknown letter, expected {known}")
+    return free

@@ -36,6 +36,8 @@ class OccupancyMap:
       spawn_radius: m; starts are drawn from free cells this near to a spawn point.
       max_steps: length of an episode.
       warnings: what the loader found odd, one line each.
+      tiles: (columns, rows) of maps of equal size laid side by side in this one (`maps.atlas`);
+        only points in the same tile reach each other.
     """
 
     name: str
@@ -47,6 +49,7 @@ class OccupancyMap:
     spawn_radius: float = 0.5
     max_steps: int = 400
     warnings: tuple[str, ...] = ()
+    tiles: tuple[int, int] = (1, 1)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -59,6 +62,19 @@ class OccupancyMap:
         """(width along x, height along y) in m."""
         rows, cols = self.shape
         return cols * self.resolution, rows * self.resolution
+
+    @property
+    def tile_m(self) -> tuple[float, float]:
+        """(width, height) of a tile in m: of the whole map, unless it holds several."""
+        width, height = self.size_m
+        return width / self.tiles[0], height / self.tiles[1]
+
+    def tile_of(self, points: ArrayLike) -> NDArray[np.int64]:
+        """The tile [...] of points [..., 2] in the grid frame, counted row by row from below."""
+        column, row = np.moveaxis(
+            np.floor(np.asarray(points, dtype=np.float64) / self.tile_m).astype(np.int64), -1, 0
+        )
+        return row * self.tiles[0] + column
 
     def identity(self) -> dict[str, Any]:
         """What tells this map from another: its size, and a SHA-256 of all that decides a task."""
@@ -211,7 +227,7 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
         raise ValueError(f"{source}: no free space for a robot of radius {robot_radius:g} m")
     labels, _ = connected_components(free)
     rows, cols = occupancy_map.shape
-    found: list[tuple[str, int]] = []
+    found: list[tuple[str, int, int]] = []
     for name, point in _named_points(occupancy_map):
         # What overflows lies outside.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -229,7 +245,13 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
             raise ValueError(
                 f"{where} is too near an obstacle, expected {robot_radius:g} m (the robot's radius)"
             )
-        found.append((name, int(labels[row, col])))
+        found.append((name, int(labels[row, col]), int(occupancy_map.tile_of(point))))
+    for tile in sorted({tile for _, _, tile in found}):
+        _require_connected([each[:2] for each in found if each[2] == tile], source)
+
+
+def _require_connected(found: list[tuple[str, int]], source: str) -> None:
+    """Check that points, given by name and component, are all in one component."""
     # The component that holds most points is the one meant; the odd one out is reported.
     main = int(np.bincount([label for _, label in found]).argmax())
     reference = next(name for name, label in found if label == main)
@@ -242,8 +264,12 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
 
 
 def reachable_cells(occupancy_map: OccupancyMap, robot_radius: float) -> NDArray[np.bool_]:
-    """The connected component, bool [H, W], of traversable cells that holds the spawn points."""
+    """The connected component, bool [H, W], of traversable cells that holds the spawn points.
+
+    Of a map with several tiles, that of each.
+    """
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
     labels, _ = connected_components(free)
-    row, col = points_to_cells(occupancy_map.spawn_points[0], occupancy_map.resolution)
-    return labels == labels[row, col] if free[row, col] else np.zeros_like(free)
+    _, firsts = np.unique(occupancy_map.tile_of(occupancy_map.spawn_points), return_index=True)
+    rows, cols = points_to_cells(occupancy_map.spawn_points[firsts], occupancy_map.resolution).T
+    return np.isin(labels, labels[rows, cols]) & free

@@ -11,6 +11,7 @@ import math
 import re
 import reprlib
 import warnings
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,6 +21,7 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from sqn_jax.maps.files import named, one_line, read_at_most
 from sqn_jax.maps.image import (
     MODES,
     GreyImage,
@@ -40,6 +42,14 @@ from sqn_jax.maps.occupancy import (
 DEFAULT_ROBOT_RADIUS = 0.1
 MAX_YAML_BYTES = 2**20
 MAX_POINTS = 10_000
+MIN_RESOLUTION, MAX_RESOLUTION = 1e-6, 1000.0  # m per cell
+MAX_PLACE = 1e9
+"""m or rad; up to here float64 knows a point to about a tenth of a micrometre."""
+_INSIDE = (
+    "a file in the YAML file's folder: copy the image beside the YAML file and write just its name "
+    "here, or allow images outside where that is offered (sqn map check --allow-outside, "
+    "load_map(..., allow_outside=True))"
+)
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _FREE_GREY, _OCCUPIED_GREY = 254, 0
 
@@ -54,10 +64,13 @@ def known_maps() -> dict[str, Path]:
     return {}
 
 
-def load_map(
-    name_or_path: str | Path, *, robot_radius: float = DEFAULT_ROBOT_RADIUS
+def load_map_file(
+    name_or_path: str | Path,
+    *,
+    robot_radius: float = DEFAULT_ROBOT_RADIUS,
+    allow_outside: bool = False,
 ) -> OccupancyMap:
-    """Load and check a map, by the name of one of the project's own or by the path of a file.
+    """Load and check one map, by the name of one of the project's own or by the path of a file.
 
     Unknown cells count as occupied and the border is closed. A map without spawn points gets
     sixteen spread over its largest free region, and the first four of these, which lie farthest
@@ -66,6 +79,9 @@ def load_map(
     Args:
       name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI, 1 m a cell) .map.
       robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
+      allow_outside: let a YAML file name an image that lies outside its own folder, by a path that
+        leads out of it or by a link. Whatever it names must still be a PNG or PNM file of the usual
+        size.
 
     Returns:
       The map, points in the grid frame.
@@ -85,30 +101,31 @@ def load_map(
         path = Path(name_or_path)
     if path.suffix.lower() == ".map":
         loaded = load_movingai(path, robot_radius=robot_radius)
-        validate(loaded, robot_radius, source=str(path))
+        validate(loaded, robot_radius, source=named(path))
         return loaded
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(
             f"unknown map {str(name_or_path)!r}, "
             f"expected one of: {', '.join(known)}, or the path of a .yaml or .map file"
         )
-    return _load_yaml(path, robot_radius)
+    return _load_yaml(path, robot_radius, allow_outside)
 
 
-def _load_yaml(path: Path, robot_radius: float) -> OccupancyMap:
+def _load_yaml(path: Path, robot_radius: float, allow_outside: bool) -> OccupancyMap:
     """Load one map_server YAML file with its image."""
     fields = _read_fields(path)
     thresholds = _thresholds(path, fields)
     resolution = _number(path, "resolution", fields["resolution"])
-    if not 0 < resolution <= 1000:
-        _fail(path, "resolution", fields["resolution"], "m per cell, above 0 and at most 1000")
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        form = f"m per cell, from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
+        _fail(path, "resolution", fields["resolution"], form)
     x, y, yaw = _numbers(path, "origin", fields["origin"], 3, "[x m, y m, yaw rad]")
     origin = (x, y, yaw)
-    image = _read_image(path, fields["image"], thresholds.mode)
+    image = _read_image(path, fields["image"], thresholds.mode, allow_outside)
     notes = []
     if (note := suspicious_level(image, thresholds)) is not None:
-        notes.append(f"{path}: {note}")
-        warnings.warn(notes[0], UserWarning, stacklevel=3)
+        notes.append(f"{named(path)}: {note}")
+        warnings.warn(notes[0], UserWarning, stacklevel=4)
     occupied = close_border(occupied_cells(image, thresholds))
     empty = np.empty((0, 2))
     frame = OccupancyMap(path.stem, occupied, resolution, empty, empty, origin)
@@ -118,7 +135,7 @@ def _load_yaml(path: Path, robot_radius: float) -> OccupancyMap:
         try:
             sampled = sample_spawn_points(occupied, resolution, robot_radius)
         except ValueError as error:
-            raise ValueError(f"{path}: image: {error}") from error
+            raise ValueError(f"{named(path)}: image: {error}") from error
         spawn = sampled if spawn is None else spawn
         evaluation = sampled[:EVALUATION_COUNT] if evaluation is None else evaluation
     loaded = OccupancyMap(
@@ -132,7 +149,7 @@ def _load_yaml(path: Path, robot_radius: float) -> OccupancyMap:
         max_steps=_max_steps(path, fields),
         warnings=tuple(notes),
     )
-    validate(loaded, robot_radius, source=str(path))
+    validate(loaded, robot_radius, source=named(path))
     return loaded
 
 
@@ -147,7 +164,7 @@ def save_map(occupancy_map: OccupancyMap, yaml_path: str | Path) -> None:
     """
     path = Path(yaml_path)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise ValueError(f"{path}: expected a path ending in .yaml")
+        raise ValueError(f"{named(path)}: expected a path ending in .yaml")
     grey = np.where(occupancy_map.occupied[::-1], _OCCUPIED_GREY, _FREE_GREY).astype(np.uint8)
     png = io.BytesIO()
     Image.fromarray(grey).save(png, format="PNG", optimize=True)
@@ -156,7 +173,7 @@ def save_map(occupancy_map: OccupancyMap, yaml_path: str | Path) -> None:
         path.with_suffix(".png").write_bytes(png.getvalue())
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from error
+        raise ValueError(f"{named(path)}: cannot be written ({error.strerror})") from error
 
 
 def _yaml_text(occupancy_map: OccupancyMap, image_name: str) -> str:
@@ -182,32 +199,41 @@ def _yaml_text(occupancy_map: OccupancyMap, image_name: str) -> str:
 def _fail(path: Path, field: str, value: object, expected: str) -> NoReturn:
     """Raise the one line every unusable file ends in; long and deep values are shortened."""
     shown = reprlib.repr(value)[:100]
-    raise ValueError(" ".join(f"{path}: {field}: {shown}, expected {expected}".split()))
+    raise ValueError(f"{named(path)}: {field}: {shown}, expected {expected}")
+
+
+class _TextLoader(yaml.BaseLoader):
+    """The safest of YAML's loaders, and no key may stand twice.
+
+    It builds nothing but text, lists and mappings, so that what counts as a number is decided
+    below, the same for 0.05, 5e-2 and "0.05".
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """A mapping; readers differ on which of two equal keys counts, so there is to be one."""
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
+        if len(mapping) < len(node.value):
+            counts = Counter(key.value for key, _ in node.value)
+            twice = max(counts, key=counts.__getitem__)
+            raise ValueError(f"{reprlib.repr(twice)} stands twice, expected every key once")
+        return mapping
 
 
 def _read_fields(path: Path) -> Mapping[str, Any]:
     """The YAML file as a mapping of its keys to text (or nested lists of text)."""
+    data = read_at_most(path, MAX_YAML_BYTES, "a map's YAML file")
     try:
-        if not path.is_file():
-            raise ValueError(f"{path}: no such file, expected a map's YAML file")
-        with path.open("rb") as file:
-            data = file.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(data) > MAX_YAML_BYTES:
-        raise ValueError(f"{path}: larger than {MAX_YAML_BYTES} bytes, expected a map's YAML file")
-    try:
-        # BaseLoader is the safest loader: it builds nothing but text, lists and mappings, so that
-        # what counts as a number is decided below, the same for 0.05, 5e-2 and "0.05".
-        fields = yaml.load(data, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, ValueError, TypeError, IndexError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path}: not readable as YAML ({reason})") from error
+        fields = yaml.load(data, Loader=_TextLoader)
+    # The parser raises a dozen kinds of error on damaged files: each means unusable.
+    except Exception as error:
+        reason = one_line(error)[:200]
+        raise ValueError(f"{named(path)}: not readable as YAML ({reason})") from error
     if not isinstance(fields, dict):
         _fail(path, "file", fields, "a mapping with the keys of a map_server YAML file")
     for key in _REQUIRED:
         if key not in fields:
-            raise ValueError(f"{path}: {key}: missing, expected the keys {', '.join(_REQUIRED)}")
+            keys = ", ".join(_REQUIRED)
+            raise ValueError(f"{named(path)}: {key}: missing, expected the keys {keys}")
     return fields
 
 
@@ -225,10 +251,13 @@ def _number(path: Path, field: str, value: object) -> float:
 
 
 def _numbers(path: Path, field: str, value: object, count: int, form: str) -> list[float]:
-    """A list of `count` finite numbers."""
+    """A list of `count` numbers that is a place: none larger than `MAX_PLACE`."""
     if not isinstance(value, list) or len(value) != count:
         _fail(path, field, value, f"{count} numbers {form}")
-    return [_number(path, f"{field}[{i}]", item) for i, item in enumerate(value)]
+    numbers = [_number(path, f"{field}[{i}]", item) for i, item in enumerate(value)]
+    if max(map(abs, numbers)) > MAX_PLACE:
+        _fail(path, field, value, f"{count} numbers {form} from {-MAX_PLACE:g} to {MAX_PLACE:g}")
+    return numbers
 
 
 def _thresholds(path: Path, fields: Mapping[str, Any]) -> Thresholds:
@@ -249,25 +278,37 @@ def _thresholds(path: Path, fields: Mapping[str, Any]) -> Thresholds:
     return Thresholds(mode=mode, negate=negate in ("1", "true", "True"), **limits)
 
 
-def _read_image(path: Path, name: object, mode: str) -> GreyImage:
-    """The image a YAML file names, which must lie in the same folder or below."""
-    form = "the name of a PNG or PGM file in the YAML file's folder"
+def _image_path(path: Path, name: object, allow_outside: bool) -> Path:
+    """The image a YAML file names: in the same folder or below, unless it may lie outside."""
+    form = "the name of a PNG or PGM file"
+    if not allow_outside:
+        form += " in the YAML file's folder"
     if not isinstance(name, str) or not name or "\0" in name:
         _fail(path, "image", name, form)
     try:
         folder = path.parent.resolve()
         image_path = (folder / name).resolve()
-        if Path(name).is_absolute() or not image_path.is_relative_to(folder):
-            _fail(path, "image", name, form)
-        if not image_path.is_file():
-            _fail(path, "image", name, f"{form} (no such file)")
+        is_file = image_path.is_file()
+    # Too long, a circle of links, or a character that no name of a file can hold.
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no file can have this name"
+        _fail(path, "image", name, f"{form} ({reason})")
+    if not (allow_outside or image_path.is_relative_to(folder)):
+        _fail(path, "image", name, _INSIDE)
+    if not is_file:
+        _fail(path, "image", name, f"{form} (no such file)")
+    return image_path
+
+
+def _read_image(path: Path, name: object, mode: str, allow_outside: bool) -> GreyImage:
+    """The pixels of the image a YAML file names."""
+    image_path = _image_path(path, name, allow_outside)
+    try:
         return read_pixels(image_path, mode)
-    except (OSError, RuntimeError) as error:
-        _fail(path, "image", name, f"{form} ({getattr(error, 'strerror', None) or error})")
+    except OSError as error:
+        _fail(path, "image", name, f"a PNG or PGM file that can be read ({error.strerror})")
     except ValueError as error:
-        if str(error).startswith(f"{path}:"):
-            raise
-        raise ValueError(f"{path}: image: {reprlib.repr(name)}: {error}") from error
+        raise ValueError(f"{named(path)}: image: {reprlib.repr(name)}: {error}") from error
 
 
 def _points(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,16 @@ def test_letters_become_cells_with_the_last_line_at_the_bottom(tmp_path: Path) -
         ("height 5", "height", "line 2"),
         ("width 7", "width 0", "width"),
         ("width 7", "width 8", "5 lines of 8"),
+        ("width 7", "width 3\n", "header"),
+        ("height 5\nwidth 7", "height 9000\nwidth 9000", "9000 x 9000 cells"),
         ("height 5", "height 6", "6 lines of 7"),
         ("map\n", "", "header"),
         ("GSO", "GxO", "letter"),
         ("@GSO..@\n", "@GSO.@\n", "lines of 7"),
+        ("@GSO..@\n", "@GSO..@.\n", "lines of 7"),
+        ("@GSO..@\n", "@GS\n..@\n", "lines of 7"),
+        ("@GSO..@\n", "@GSO..@@", "lines of 7"),
+        ("@GSO..@\n", "@GSO..@\n\n", "lines of 7"),
         (SOUND, "", "header"),
         (".", "@", "no free space"),
     ],
@@ -46,6 +53,30 @@ def test_a_damaged_file_is_refused(tmp_path: Path, old: str, new: str, words: st
         load_map(path)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_the_last_line_need_not_end_and_what_follows_is_left_out(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "small.map"
+    path.write_bytes(SOUND.replace("\n", end).encode())
+    whole = load_map(path).occupied
+    for text in (SOUND.rstrip("\n"), SOUND + "\n\n", SOUND + "more\n" * 9):
+        path.write_bytes(text.replace("\n", end).encode())
+        np.testing.assert_array_equal(load_map(path).occupied, whole)
+
+
+def test_a_file_of_nothing_but_line_ends_needs_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "lines.map"
+    path.write_bytes(b"type octile\nheight 9\nwidth 9\nmap\n" + b"ab\n" * 700_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="9 lines of 9 letters"):
+            load_map(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # The file's bytes, a few times over; as 700,000 lines they would take thirty million.
+    assert peak < 12_000_000
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:

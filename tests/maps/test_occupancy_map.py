@@ -13,12 +13,15 @@ from hypothesis import strategies as st
 from sqn_jax.maps import (
     OccupancyMap,
     describe,
+    distance,
     points_to_cells,
     reachable_cells,
     sample_spawn_points,
     traversable,
     validate,
 )
+from sqn_jax.maps.check import evaluation_distances
+from sqn_jax.maps.distance import goal_distance
 
 
 def walled(rows: int, cols: int) -> np.ndarray:
@@ -97,6 +100,7 @@ def test_a_sound_map_is_accepted() -> None:
         ({"spawn_points": [[0.5, 0.5], [2.0, 7.0]]}, ["spawn_points[1]", "(2, 7)", "outside"]),
         ({"spawn_points": [[0.5, 0.5], [-0.01, 1.0]]}, ["spawn_points[1]", "outside"]),
         ({"spawn_points": [[1e300, 0.5], [1.0, 1.0]]}, ["spawn_points[0]", "outside"]),
+        ({"spawn_points": [[1e308, -1e308], [1.0, 1.0]]}, ["spawn_points[0]", "outside"]),
         ({"spawn_points": [[math.nan, 0.5], [1.0, 1.0]]}, ["spawn_points[0]", "not finite"]),
         ({"evaluation_points": [[0.5, 0.5], [2.55, 1.0]]}, ["evaluation_points[1]", "obstacle"]),
         ({"evaluation_points": [[0.5, 0.5], [2.45, 1.0]]}, ["evaluation_points[1]", "too near"]),
@@ -167,3 +171,22 @@ def test_the_report_names_what_a_person_asks_for() -> None:
     assert float(line.split()[5]) == pytest.approx(2.46, abs=0.005)
     assert "max_steps is" not in report
     assert "max_steps is 5" in describe(room_map(max_steps=5), 0.1)
+
+
+def test_the_report_holds_few_distance_fields_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Nine points in the open: no way is shorter than the line, and none much longer.
+    points = np.stack(np.meshgrid([0.5, 1.2, 2.1], [0.5, 1.5, 2.5]), axis=-1).reshape(-1, 2)
+    at_once = []
+
+    def counted(free: np.ndarray, resolution: float, goals: np.ndarray) -> np.ndarray:
+        at_once.append(len(goals))
+        return goal_distance(free, resolution, goals)
+
+    monkeypatch.setattr(distance, "goal_distance", counted)
+    monkeypatch.setattr(distance, "FIELD_CELLS", 2 * 32 * 62)
+    geodesic, straight = evaluation_distances(room_map(evaluation_points=points))
+    assert at_once == [2, 2, 2, 2, 1]
+    expected = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    np.testing.assert_allclose(straight, expected)
+    # A way begins at the centre of a cell: up to half its diagonal off.
+    np.testing.assert_allclose(geodesic, expected, rtol=0.02, atol=0.08)

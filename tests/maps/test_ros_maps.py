@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 import warnings
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,6 +132,61 @@ def test_colour_is_averaged(room: Room) -> None:
 @pytest.mark.parametrize("mode", ["P", "1"])
 def test_palette_and_black_and_white_images_are_read(room: Room, mode: str) -> None:
     assert free_bands(room(image=png_bytes(blocks(255, 0, 255), mode)), 3) == [True, False, True]
+
+
+def test_an_image_without_alpha_reads_the_same_in_scale_mode(room: Room) -> None:
+    grey = blocks(254, 206, 205, 0)
+    assert free_bands(room(grey=grey, mode="scale"), 4) == [True, True, False, False]
+
+
+@pytest.mark.parametrize("kind", ["grey", "16 bit", "colour", "palette"])
+def test_a_shade_that_is_marked_as_clear_is_unknown_in_scale_mode(room: Room, kind: str) -> None:
+    clear: object = 255
+    image = Image.fromarray(blocks(255, 254, 0))
+    if kind == "16 bit":
+        image, clear = Image.fromarray(blocks(65535, 65534, 0, dtype=np.uint16)), 65535
+    elif kind == "colour":
+        image, clear = image.convert("RGB"), (255, 255, 255)
+    elif kind == "palette":
+        image, clear = Image.fromarray(blocks(2, 1, 0)), 2
+        image.putpalette([0, 0, 0, 254, 254, 254, 255, 255, 255])
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG", transparency=clear)
+    scale = room(image=buffer.getvalue(), mode="scale")
+    assert free_bands(scale, 3) == [False, True, False]
+    # Trinary averages a palette's alpha in: (3 * 255 + 0) / 4 is occupancy 0.25.
+    trinary = room(image=buffer.getvalue(), mode="trinary")
+    assert free_bands(trinary, 3) == [kind != "palette", True, False]
+
+
+@pytest.mark.parametrize("kind", ["P1", "P3", "P4", "P6"])
+def test_the_other_kinds_of_pnm_are_read(room: Room, kind: str) -> None:
+    light = blocks(1, 0, 1)
+    if kind == "P1":  # Bits, 1 is black.
+        image = b"P1\n90 20\n" + b" ".join(b"%d" % (1 - bit) for bit in light.ravel())
+    elif kind == "P4":
+        image = b"P4\n90 20\n" + np.packbits(1 - light, axis=1).tobytes()
+    elif kind == "P3":
+        image = b"P3\n90 20\n255\n" + b" ".join(b"%d 255 255" % (255 * v) for v in light.ravel())
+        # Cyan, (0, 255, 255), is occupancy 1/3.
+    else:
+        image = b"P6\n90 20\n255\n" + np.repeat(light * np.uint8(255), 3).tobytes()
+    assert free_bands(room(image=image), 3) == [True, False, True]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_a_grey_png_of_few_bits_is_read(room: Room, bits: int) -> None:
+    top = 2**bits - 1
+    shifts = np.arange(bits)[::-1]
+    packed = np.packbits((blocks(top, 0, top)[..., None] >> shifts & 1).reshape(20, -1), axis=1)
+    rows = b"".join(b"\0" + row.tobytes() for row in packed)
+    chunks = {b"IHDR": struct.pack(">IIBBBBB", 90, 20, bits, 0, 0, 0, 0)}
+    chunks |= {b"IDAT": zlib.compress(rows), b"IEND": b""}
+    image = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks.items()
+    )
+    assert free_bands(room(image=image), 3) == [True, False, True]
 
 
 @pytest.mark.parametrize("kind", ["pgm", "png"])
