@@ -16,15 +16,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 GRACE = 5.0
 """Seconds the main thread is given to end in order, where nothing is left to be saved."""
 
-_CLOSE = 0
-"""A byte that no signal has."""
+_CLOSE, _AGAIN = 0, 255
+"""Bytes that no signal has: the thread is to end; what was raised has got lost."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -65,6 +65,14 @@ def interruptible(command: str = "sqn") -> Iterator[None]:
     def stop(number: int, _: FrameType | None) -> NoReturn:
         raise Interrupted(number)
 
+    def raise_again(lost: Any) -> None:
+        # A callback of the garbage collector, say: what it raises goes nowhere.
+        if lost.exc_type is Interrupted:
+            os.write(writer, bytes([_AGAIN]))
+        else:
+            told(lost)
+
+    told, sys.unraisablehook = sys.unraisablehook, raise_again
     before = {each: signal.signal(each, stop) for each in STOPPING}
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -79,6 +87,7 @@ def interruptible(command: str = "sqn") -> Iterator[None]:
         watch.join()
         os.close(reader)
         os.close(writer)
+        sys.unraisablehook = told
         for each, handler in before.items():
             signal.signal(each, handler)
 
@@ -147,6 +156,11 @@ def _watch(reader: int, command: str) -> None:
         (number,) = os.read(reader, 1)
         if number == _CLOSE:
             return
+        if number == _AGAIN:
+            time.sleep(0.02)
+            signal.pthread_kill(threading.main_thread().ident or 0, first)
+            os.read(reader, 1)  # Of the signal just sent, which is no second one.
+            continue
         if number not in STOPPING:
             continue
         if first:

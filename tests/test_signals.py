@@ -85,6 +85,26 @@ def test_compiled_code_is_not_waited_for_where_nothing_is_to_be_saved(
     assert 0.25 < time.monotonic() - sent < 10
 
 
+IN_A_CALLBACK = """
+        import gc
+        gc.callbacks.append(lambda phase, info: time.sleep(0.01))
+        while True:
+            gc.collect()
+            time.sleep(0.005)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_gets_lost_in_a_callback_is_raised_again(number: signal.Signals) -> None:
+    """Python prints what the garbage collector's callbacks raise, and goes on."""
+    for _ in range(3):
+        child = Child(IN_A_CALLBACK.strip(), grace=1000)
+        child.send(number)
+        code, out, err = child.end()
+        assert (code, out) == (128 + number, "in order\n")
+        assert err == f"\nsqn: stopped by {number.name}\ngo on with this\n"
+
+
 def test_a_second_signal_ends_at_once() -> None:
     child = Child(IN_COMPILED_CODE, grace=1000)
     child.send(signal.SIGTERM)
