@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from sqn_jax.maps.files import one_line
+from sqn_jax.maps.png import require_all_rows
 
 MAX_PIXELS = 64 * 2**20
 MAX_IMAGE_BYTES = 512 * 2**20
@@ -75,6 +76,7 @@ def read_pixels(path: Path, mode: str) -> GreyImage:
                 width, height = image.size
                 if width * height > MAX_PIXELS:
                     raise ValueError(f"{width} x {height} pixels, expected at most {MAX_PIXELS}")
+                require_all_rows(data)
                 return _to_grey(image, mode)
         except UnidentifiedImageError as error:
             raise ValueError("contents of another kind, expected a PNG or PGM image") from error

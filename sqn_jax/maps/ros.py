@@ -329,8 +329,9 @@ def _spawn_radius(path: Path, fields: Mapping[str, Any]) -> float:
     if "spawn_radius" not in fields:
         return OccupancyMap.spawn_radius
     radius = _number(path, "spawn_radius", fields["spawn_radius"])
-    if radius < 0:
-        _fail(path, "spawn_radius", fields["spawn_radius"], "a length >= 0 in m")
+    if not 0 <= radius <= MAX_PLACE:
+        form = f"a length >= 0 in m, at most {MAX_PLACE:g}"
+        _fail(path, "spawn_radius", fields["spawn_radius"], form)
     return radius
 
 

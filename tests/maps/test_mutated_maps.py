@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import resource
 import sys
@@ -52,7 +51,7 @@ def assert_usable(loaded: OccupancyMap, robot_radius: float) -> None:
         assert (points < (cols * loaded.resolution, rows * loaded.resolution)).all()
         assert np.isfinite(loaded.to_map_frame(points)).all()
     assert max(map(abs, loaded.origin)) <= MAX_PLACE
-    assert 0 <= loaded.spawn_radius < math.inf
+    assert 0 <= loaded.spawn_radius <= MAX_PLACE
     assert isinstance(loaded.max_steps, int)
     assert 1 <= loaded.max_steps <= 1_000_000
     assert loaded.name in describe(loaded, robot_radius)

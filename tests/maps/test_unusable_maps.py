@@ -85,6 +85,7 @@ def test_a_missing_key_is_named(room: Room, key: str) -> None:
         ("evaluation_points", "~", "a list of 2"),
         ("evaluation_points", "[[1, 1], [0.05, 1]]", "obstacle"),
         ("spawn_radius", "-1", ">= 0"),
+        ("spawn_radius", "1e308", "at most 1e+09"),
         ("spawn_radius", "wide", "finite number"),
         ("max_steps", "0", "1 to 1000000"),
         ("max_steps", "2.5", "whole number"),
