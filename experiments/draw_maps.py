@@ -250,7 +250,11 @@ def main() -> None:
         drawn = make()
         validate(drawn, ROBOT_RADIUS)
         path = arguments.out / f"{drawn.name}.yaml"
-        save_map(drawn, path)
+        try:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            save_map(drawn, path)
+        except (OSError, ValueError) as error:
+            parser.error(str(error))
         print(path)
 
 

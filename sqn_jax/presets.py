@@ -77,5 +77,5 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(),
     "smoke": _smoke(),
 }
-"""`quick` is the default, `best` trains on many mazes, `paper` follows the paper to the letter, `smoke`
-is for tests."""
+"""`quick` is the default, `best` trains on many mazes, `paper` follows the paper to the letter,
+`smoke` is for tests."""

@@ -31,6 +31,15 @@ from sqn_jax.maps import (
 NUM_NEIGHBORS = 4
 """Spawn points that count as near a spawn point."""
 
+MAX_CELLS = 2**23
+"""Cells of a map: the table of free space then takes about two minutes and half a gigabyte."""
+
+MAX_LATTICE_POINTS = 2**22
+"""Points on which the covered area is counted; every robot holds a bit of each."""
+
+MAX_SPAWN_PLACES = 2**25
+"""Places to start from, of all spawn points together."""
+
 BODY_SECTORS = 8
 """Directions in the table for collisions; a step is short, so a coarse table does."""
 
@@ -67,6 +76,7 @@ def make_env(
         validate(occupancy_map, config.robot_radius)
     else:
         occupancy_map = load_map(name, robot_radius=config.robot_radius)
+    _require_size(occupancy_map, config)
     body_free = traversable(occupancy_map.occupied, occupancy_map.resolution, config.robot_radius)
     positions, counts = _spawn_positions(occupancy_map, body_free, spawn)
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
@@ -105,6 +115,31 @@ def make_env(
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
         tile=None if occupancy_map.tiles == (1, 1) else (width_m, height_m),
     )
+
+
+def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
+    """Refuse maps that would take minutes and gigabytes to prepare."""
+    name, (height, width) = occupancy_map.name, occupancy_map.shape
+    if height * width > MAX_CELLS:
+        raise ValueError(
+            f"map {name}: {width} x {height} cells, expected at most {MAX_CELLS:,}: coarser ones"
+        )
+    width_m, height_m = occupancy_map.tile_m
+    points = (width_m + 1) * (height_m + 1) / config.coverage_cell**2
+    if points > MAX_LATTICE_POINTS:
+        raise ValueError(
+            f"map {name}: {width_m:,.0f} x {height_m:,.0f} m with env.coverage_cell "
+            f"{config.coverage_cell:g} m are {points:,.0f} points to count the covered area on, "
+            f"expected at most {MAX_LATTICE_POINTS:,}: a smaller map or a larger env.coverage_cell"
+        )
+    reach = occupancy_map.spawn_radius / occupancy_map.resolution + 1
+    places = len(occupancy_map.spawn_points) * min(math.pi * reach**2, height * width)
+    if places > MAX_SPAWN_PLACES:
+        raise ValueError(
+            f"map {name}: {len(occupancy_map.spawn_points)} spawn points with spawn_radius "
+            f"{occupancy_map.spawn_radius:g} m are {places:,.0f} places to start from, expected at "
+            f"most {MAX_SPAWN_PLACES:,}: fewer points or a smaller radius"
+        )
 
 
 def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> EnvParams:
@@ -176,11 +211,13 @@ def _nearest(points: NDArray[np.float64], groups: NDArray[np.int64]) -> NDArray[
 
     Fewer, where a group has no more points.
     """
-    distances = np.hypot(*np.moveaxis(points[:, None] - points[None], -1, 0))
-    np.fill_diagonal(distances, np.inf)
-    distances[groups[:, None, 0] != groups[None, :, 0]] = np.inf
     count = min(NUM_NEIGHBORS, groups[:, 1].min() - 1)
-    return np.argsort(distances, axis=1, kind="stable")[:, :count]
+    found = np.empty((len(points), count), np.int64)
+    for index, (point, (first, size)) in enumerate(zip(points, groups, strict=True)):
+        distances = np.hypot(*(points[first : first + size] - point).T)
+        distances[index - first] = np.inf
+        found[index] = first + np.argsort(distances, kind="stable")[:count]
+    return found
 
 
 def _spawn_positions(

@@ -13,9 +13,10 @@ import pytest
 from grid_oracle import open_map, wrap_map
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import make_env
+from sqn_jax.env import make_env, prepare
 from sqn_jax.env.dynamics import move
 from sqn_jax.maps import OccupancyMap, save_map
+from sqn_jax.maps.occupancy import close_border
 
 
 def refused(make, *parts: str) -> None:
@@ -118,3 +119,37 @@ def test_a_robot_that_starts_on_the_border_of_a_cell_can_move() -> None:
     # Backward, 0.125 m: a whole step forward would need more than the 0.25 m there are.
     assert not refused
     assert pose[0] < 0.2
+
+
+def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
+    """Before anything of that size is allocated."""
+    occupied = np.zeros((40, 40), dtype=bool)
+    points = np.array([[0.3, 0.3], [0.7, 0.7]])
+    room = OccupancyMap("room", close_border(occupied), 0.05, 2 * points, 2 * points)
+    make_env(room)
+    wide = dataclasses.replace(
+        room, resolution=100.0, spawn_points=4000 * points, evaluation_points=4000 * points
+    )
+    many = dataclasses.replace(
+        room, spawn_points=np.tile(2 * points, (12_000, 1)), spawn_radius=1e6
+    )
+    vast = dataclasses.replace(room, occupied=close_border(np.zeros((3000, 3000), dtype=bool)))
+    for large, fault in (
+        (wide, r"4,000 x 4,000 m with env\.coverage_cell 0\.325 m are 151,"),
+        (many, r"24000 spawn points with spawn_radius 1e\+06 m are 38,400,000 places"),
+        (vast, r"3000 x 3000 cells, expected at most 8,388,608"),
+    ):
+        with pytest.raises(ValueError, match=fault):
+            make_env(large)
+
+
+def test_neighbours_are_the_nearest_points_and_of_two_as_near_the_first() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.integers(0, 6, (40, 2)).astype(float)
+    groups = np.repeat([[0, 25], [25, 15]], [25, 15], axis=0)
+    found = prepare._nearest(points, groups)
+    for index in range(40):
+        group = range(25) if index < 25 else range(25, 40)
+        others = [other for other in group if other != index]
+        others.sort(key=lambda other: math.dist(points[other], points[index]))
+        assert found[index].tolist() == others[:4]
