@@ -147,7 +147,8 @@ class Checkpoints:
             told = f"checkpoint {self._place(chunk)}: damaged, {error}"
             older = [each for each in self.chunks() if each < chunk and self._is_sound(each)]
             if older:
-                told += f"; that of chunk {older[-1]} is sound, and --resume goes on from it"
+                told += f"; that of chunk {older[-1]} is sound: --resume goes on from it, "
+                told += f"--checkpoint {older[-1]} takes it"
             raise ValueError(told) from None
         return self._restored(chunk, found, {name: params_shapes})[name]
 

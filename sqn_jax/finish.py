@@ -70,6 +70,8 @@ def draw(drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder:
         print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
         return False
     name = f"{config.algo.upper()} on {occupancy_map.name}"
+    if (count := len(split_names(config.map))) > 1:
+        name += f" (trained on {count} maps)"
     curve = figures.learning_curve(folder.read_metrics(), title=name)
     figures.save(curve, folder.figures / "learning_curve.png")
     for tasks, (summary, trace) in drawn.items():

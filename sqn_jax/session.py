@@ -83,9 +83,9 @@ def train_session(
     with ExitStack() as stack:
         stack.enter_context(locked(run_dir))
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
-        _announce(config, env_params, run_dir, mesh, held)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
         runner = _restored(env_params, config, mesh, folder, checkpoints) if resume else None
+        _announce(config, env_params, run_dir, mesh, held)
         done = 0 if runner is None else _rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
         training = _Training(env_params, config, mesh, folder, checkpoints)

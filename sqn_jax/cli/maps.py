@@ -9,7 +9,7 @@ def check_map(words: list[str]) -> int:
     """Say what a map offers."""
     parser = Parser(prog="sqn map", description="Look at maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
-    parser.add_argument("file", help="a ROS map_server YAML file, or a map of the project by name")
+    parser.add_argument("file", help="a file, a map of the project by name, or maze:7, maze:0-3")
     parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
     parser.add_argument(
         "--allow-outside",

@@ -105,8 +105,8 @@ def load_map_file(
         return loaded
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(
-            f"unknown map {str(name_or_path)!r}, "
-            f"expected one of: {', '.join(known)}, or the path of a .yaml or .map file"
+            f"unknown map {str(name_or_path)!r}, expected one of: {', '.join(known)}, a procedural "
+            "one such as maze:7, or the path of a .yaml or .map file"
         )
     return _load_yaml(path, robot_radius, allow_outside)
 
