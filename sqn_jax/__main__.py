@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqn_jax.cli import main
+from sqn_jax.cli import run
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run()

@@ -28,12 +28,15 @@ from sqn_jax import manifest
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.networks import Params
 from sqn_jax.manifest import Damaged, Manifest, Mismatch, Origin
-from sqn_jax.runlog import flush_to_disk
+from sqn_jax.runlog import CHECKPOINTS, flush_to_disk
 from sqn_jax.train import RunnerState
 
-FOLDER = "checkpoints"
+FOLDER = CHECKPOINTS
 KEPT = 2
 """How many of the newest are kept; the best one besides."""
+
+OVERHEAD_BYTES = 2**21
+"""What a checkpoint takes besides its arrays, at most: some fifty small files, and the manifest."""
 
 # Orbax reports every file it touches; a user wants to see the progress of the training.
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -86,6 +89,7 @@ class Checkpoints:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._sweep()
+            _require_space(self._folder, items)
             told = {name: ocp.args.StandardSave(item) for name, item in items.items()}
             self._orbax.save(partial, args=ocp.args.Composite(**told))
             manifest.write(partial, items, self._origin, chunk=chunk, score=score, exact=exact)
@@ -242,9 +246,26 @@ class Checkpoints:
         return f"checkpoint {self._place(chunk)}: cannot be written ({_reason(error)}); {left}"
 
 
+def _require_space(folder: Path, items: dict[str, Any]) -> None:
+    """Refuse to begin what a disk has no room for.
+
+    Orbax's file library goes on writing in threads of its own after a write has failed, and each
+    of them prints a traceback.
+    """
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items)) + OVERHEAD_BYTES
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC,
+            f"{os.strerror(errno.ENOSPC)}: {free / 1e6:,.1f} MB free, {needed / 1e6:,.1f} needed",
+        )
+
+
 def _reason(error: Exception) -> str:
     """What the system said, out of the long story of a library."""
     told = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
         if os.strerror(number) in told:
             return os.strerror(number)

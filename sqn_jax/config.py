@@ -298,6 +298,8 @@ class TrainConfig:
             self.total_episodes,
             f"at least num_envs ({self.num_envs}), one round",
         )
+        most = 10**9
+        require(self.total_episodes <= most, "total_episodes", self.total_episodes, f"up to {most}")
         require_positive(self, "", "checkpoint_minutes")
         require_not_negative(self, "", "max_skipped_updates")
         if self.method == "r2d2":
@@ -379,7 +381,7 @@ def load(path: Path) -> TrainConfig:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not valid JSON ({error})") from None
     try:
         return typing.cast(TrainConfig, from_dict(data))

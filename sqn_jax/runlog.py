@@ -10,6 +10,7 @@ summary.json     what it came to
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -25,6 +26,7 @@ from sqn_jax.config import TrainConfig
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 SUMMARY = "summary.json"
+CHECKPOINTS = "checkpoints"
 OWN_NAMES = ("config", "evaluation", "metrics", "summary")
 """Names of a run's own files, whatever they end in."""
 
@@ -51,6 +53,12 @@ class RunFolder:
             ValueError: the folder already holds a run, or cannot be written.
         """
         folder = cls(path)
+        left = [name for name in (METRICS, CHECKPOINTS) if os.path.lexists(path / name)]
+        if left and not (path / CONFIG).exists():
+            raise ValueError(
+                f"run folder {path}: holds {left[0]} of a run without its {CONFIG}, expected "
+                "another folder"
+            )
         if (path / CONFIG).exists():
             raise ValueError(
                 f"run folder {path}: already holds a run; continue it with "
@@ -100,8 +108,11 @@ class RunFolder:
 
     def flush_metrics(self) -> None:
         """Let the rows so far survive a power cut."""
-        with (self.path / METRICS).open("a", encoding="utf-8") as file:
-            flush_to_disk(file.fileno())
+        try:
+            with (self.path / METRICS).open("a", encoding="utf-8") as file:
+                flush_to_disk(file.fileno())
+        except OSError as error:
+            raise NotWritten(self.path / METRICS, error) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The rows of metrics.jsonl; a half-written last line is left out.
@@ -115,7 +126,7 @@ class RunFolder:
         for number, line in enumerate(lines, start=1):
             try:
                 row = json.loads(line.decode("utf-8"))
-            except ValueError:
+            except (ValueError, RecursionError):
                 if number == len(lines):
                     break
                 row = None
@@ -151,8 +162,11 @@ def probe_writable(folder: Path) -> None:
 
 def flush_to_disk(descriptor: int) -> None:
     """Let what was written to a file survive a power cut, where the file system can do that."""
-    with suppress(OSError):
+    try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ The numbers come from `train` and `evaluate`; this module decides what is said a
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from sqn_jax import devices, divergence, finish, manifest, memory
-from sqn_jax.checkpoint import Checkpoints
+from sqn_jax.checkpoint import FOLDER, Checkpoints
 from sqn_jax.compare import Agent, Settings, evaluate_agents, load_maps, num_episodes
 from sqn_jax.compilation import kept_programs, watched_compilation
 from sqn_jax.config import TrainConfig
@@ -26,7 +27,7 @@ from sqn_jax.lock import locked
 from sqn_jax.manifest import Manifest, Origin
 from sqn_jax.maps import load_map, split_names
 from sqn_jax.progress import episodes_bar
-from sqn_jax.runlog import RunFolder, write_json, write_records
+from sqn_jax.runlog import SUMMARY, RunFolder, write_json, write_records
 from sqn_jax.signals import Interrupted, collected
 from sqn_jax.tensorboard import Board, require_tensorboard
 from sqn_jax.train import (
@@ -146,6 +147,7 @@ def _restored(
             fresh = start_run(env_params, config, mesh)
             runner = dataclasses.replace(runner, memory=fresh.memory)
     else:
+        _require_none_lost(folder, config)
         print("stopped before its first checkpoint: starting from the beginning")
     folder.write_config(config)
     folder.keep_metrics(chunks)
@@ -157,6 +159,24 @@ def _restored(
             f"{folder.path}: metrics.jsonl has {len(rows)} rows of {chunks} chunks", stacklevel=2
         )
     return runner
+
+
+def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
+    """Refuse to start from the beginning where there must have been checkpoints."""
+    place = folder.path / FOLDER
+    rows = folder.read_metrics()
+    seconds = float(rows[-1].get("wall_seconds") or 0.0) if rows else 0.0
+    is_odd = os.path.lexists(place) and not place.is_dir()
+    if (
+        is_odd
+        or any(place.glob("*.damaged"))
+        or (folder.path / SUMMARY).exists()
+        or seconds > 120 * config.checkpoint_minutes
+    ):
+        raise ValueError(
+            f"{place}: holds no checkpoint that can be used, but the run has been further; put "
+            "them back, or start a new run in another folder"
+        )
 
 
 def _compare_makes(told: Manifest, mesh: Mesh | None) -> None:
@@ -188,7 +208,7 @@ class _Training:
         rows = folder.read_metrics()
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
-            "train_seconds": float(rows[-1]["wall_seconds"]) if rows else 0.0,
+            "train_seconds": float(rows[-1].get("wall_seconds") or 0.0) if rows else 0.0,
             "env_steps": 0.0,
             "num_devices": 1 if mesh is None else mesh.size,
             "compile_seconds": 0.0,

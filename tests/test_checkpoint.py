@@ -143,7 +143,7 @@ def files_of(step: Path) -> list[Path]:
     return sorted(path.relative_to(step) for path in step.rglob("*") if path.is_file())
 
 
-DAMAGE = [flip, cut, delete, grow]
+DAMAGE = [flip, cut, delete, pytest.param(grow, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -418,6 +418,25 @@ def test_what_stands_in_the_way_is_set_aside(
         checkpoints.restore(shapes)
         checkpoints.save(2, states[0])
         assert_same(checkpoints.restore(shapes)[0], states[0])
+        assert checkpoints.chunks() == [1, 2]
+
+
+def test_a_disk_without_room_is_not_written_to(
+    folder: Path, states: list[RunnerState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Orbax's threads would each print a traceback."""
+
+    def written(*_: Any, **__: Any) -> None:
+        raise AssertionError("written to")
+
+    num_bytes = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(states[0].learner))
+    with opened(folder) as checkpoints:
+        monkeypatch.setattr(checkpoints._orbax, "save", written)
+        usage = shutil.disk_usage(folder)._replace(free=num_bytes)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+        fault = r"\(No space left on device: 0\.\d MB free, 2\.\d needed\); that of chunk 2 is"
+        with pytest.raises(NotSaved, match=fault):
+            checkpoints.save(3, states[0])
         assert checkpoints.chunks() == [1, 2]
 
 

@@ -9,6 +9,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -327,3 +328,33 @@ def test_a_run_that_diverges_stops_with_a_dump_and_saves_nothing_of_it(tiny: Tin
     assert worst["largest"] > 1e29
     assert all(each["not_finite"] == 0 for each in dump["arrays"].values())
     assert max(runs.saved("astray")) == len(skipped) - 1
+
+
+# Folders that lack something.
+
+
+def test_a_run_whose_checkpoints_are_out_of_sight_does_not_start_again(
+    tiny: TinyRuns, tmp_path: Path
+) -> None:
+    """A disk that is not mounted, say: its metrics would be gone."""
+    shutil.copytree(tiny.folder / "straight", tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    metrics = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    for odd in (True, False):
+        if odd:
+            (tmp_path / "run" / "checkpoints").symlink_to(tmp_path / "nowhere")
+        else:
+            (tmp_path / "run" / "checkpoints").unlink()
+        code, _, err = tiny.call(str(tmp_path / "run"), "--total-episodes", "60", resume=True)
+        assert code == 2
+        assert "holds no checkpoint that can be used" in err
+        assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == metrics
+        assert (tmp_path / "run" / "summary.json").exists()
+
+
+def test_a_new_run_is_not_mixed_with_the_rest_of_an_old_one(tiny: TinyRuns, tmp_path: Path) -> None:
+    shutil.copytree(tiny.folder / "straight", tmp_path / "run")
+    (tmp_path / "run" / "config.json").unlink()
+    code, _, err = tiny.call(str(tmp_path / "run"))
+    assert code == 2
+    assert "holds metrics.jsonl of a run without its config.json" in err

@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
@@ -45,6 +46,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     return code
+
+
+def run() -> NoReturn:
+    """The process `sqn`: end with the exit code of `main`.
+
+    After a signal or a failure at once: threads of XLA or Orbax may still be at work, and would
+    crash or complain while Python is taken down.
+    """
+    code = main()
+    if code == 1 or code > 128:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _dispatch(words: list[str]) -> int:
