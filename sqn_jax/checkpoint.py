@@ -31,7 +31,6 @@ from sqn_jax.manifest import Damaged, Manifest, Mismatch, Origin
 from sqn_jax.runlog import CHECKPOINTS, flush_to_disk
 from sqn_jax.train import RunnerState
 
-FOLDER = CHECKPOINTS
 KEPT = 2
 """How many of the newest are kept; the best one besides."""
 
@@ -50,7 +49,7 @@ class Checkpoints:
     """The checkpoints of one run folder; use as a context manager."""
 
     def __init__(self, run_dir: Path, origin: Origin) -> None:
-        self._folder = (run_dir / FOLDER).absolute()
+        self._folder = (run_dir / CHECKPOINTS).absolute()
         self._origin = origin
         self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
 

@@ -334,6 +334,15 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted names, `learner.discount` for one of a group."""
+    named: dict[str, Any] = {}
+    for name, value in tree.items():
+        label = f"{prefix}{name}"
+        named |= flat(value, f"{label}.") if isinstance(value, dict) else {label: value}
+    return named
+
+
 def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
     """Rebuild a config from `to_dict`'s output.
 

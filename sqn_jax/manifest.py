@@ -178,13 +178,13 @@ def _contents(folder: Path) -> dict[str, Any]:
     contents = told.get("contents") if isinstance(told, dict) else None
     if not isinstance(contents, dict) or told.get("sha256") != _contents_digest(contents):
         raise Damaged(f"{NAME} is not what was written")
-    if contents.get("schema") == SCHEMA and not _is_well_formed(contents):
-        raise Damaged(f"{NAME} lacks what every manifest has")
     if contents.get("schema") != SCHEMA:
         raise ValueError(
             f"{folder / NAME}: schema {contents.get('schema')!r}, expected {SCHEMA}, that of "
             f"sqn_jax {sqn_jax.__version__}"
         )
+    if not _is_well_formed(contents):
+        raise Damaged(f"{NAME} lacks what every manifest has")
     return contents
 
 
@@ -214,7 +214,10 @@ def differences(
         origin: the run.
         shapes: the trees it should hold, as arrays or structs.
     """
-    then, now = _flat(manifest.contents["config"]), _flat(configs.to_dict(origin.config))
+    then, now = (
+        configs.flat(manifest.contents["config"]),
+        configs.flat(configs.to_dict(origin.config)),
+    )
     rows = [
         (name, _word(then, name), _word(now, name))
         for name in [*now, *(then.keys() - now.keys())]
@@ -223,8 +226,8 @@ def differences(
     # Where a map lies is no matter as long as it is the same.
     if origin.world is not None:
         rows = [row for row in rows if row[0] != "map"]
-        world = _flat(manifest.contents["world"] or {}, "map.")
-        here = _flat(json.loads(json.dumps(origin.world)), "map.")
+        world = configs.flat(manifest.contents["world"] or {}, "map.")
+        here = configs.flat(json.loads(json.dumps(origin.world)), "map.")
         rows += [
             (name, _word(world, name), _word(here, name))
             for name in here
@@ -303,17 +306,6 @@ def _form(leaf: Any) -> dict[str, Any]:
 
 def _form_word(form: Mapping[str, Any] | None) -> str:
     return "-" if form is None else f"{form['dtype']} {tuple(form['shape'])}"
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[f"{prefix}{name}"] = value
-    return flat
 
 
 def _word(settings: Mapping[str, Any], name: str) -> str:

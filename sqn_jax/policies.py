@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from sqn_jax.agent.networks import Params, initial_carry
-from sqn_jax.checkpoint import FOLDER, Checkpoints
+from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import Observation
 from sqn_jax.manifest import Origin
-from sqn_jax.runlog import RunFolder
+from sqn_jax.runlog import CHECKPOINTS, RunFolder
 from sqn_jax.train import averages, network_of
 
 
@@ -66,7 +66,7 @@ def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
         Mismatch: the checkpoint is of another run than the config says.
     """
     _, config = RunFolder.open(run_dir)
-    if not (run_dir / FOLDER).is_dir():
+    if not (run_dir / CHECKPOINTS).is_dir():
         raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
     with Checkpoints(run_dir, Origin(config)) as checkpoints:
         params = checkpoints.restore_policy(

@@ -53,16 +53,16 @@ class RunFolder:
             ValueError: the folder already holds a run, or cannot be written.
         """
         folder = cls(path)
-        left = [name for name in (METRICS, CHECKPOINTS) if os.path.lexists(path / name)]
-        if left and not (path / CONFIG).exists():
-            raise ValueError(
-                f"run folder {path}: holds {left[0]} of a run without its {CONFIG}, expected "
-                "another folder"
-            )
         if (path / CONFIG).exists():
             raise ValueError(
                 f"run folder {path}: already holds a run; continue it with "
                 f"`sqn train --run-dir {path} --resume`, or name another folder"
+            )
+        left = [name for name in (METRICS, CHECKPOINTS) if os.path.lexists(path / name)]
+        if left:
+            raise ValueError(
+                f"run folder {path}: holds {left[0]} of a run without its {CONFIG}, expected "
+                "another folder"
             )
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -136,6 +136,11 @@ class RunFolder:
                 )
             rows.append(row)
         return rows
+
+    def train_seconds(self) -> float:
+        """How long the run has trained, by its last row; 0 where none says so."""
+        rows = self.read_metrics()
+        return float(rows[-1].get("wall_seconds") or 0.0) if rows else 0.0
 
     def keep_metrics(self, chunks: int) -> None:
         """Drop the rows past `chunks` chunks, which a resumed run will write again."""

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from sqn_jax import devices, divergence, finish, manifest, memory
-from sqn_jax.checkpoint import FOLDER, Checkpoints
+from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.compare import Agent, Settings, evaluate_agents, load_maps, num_episodes
 from sqn_jax.compilation import kept_programs, watched_compilation
 from sqn_jax.config import TrainConfig
@@ -27,7 +27,7 @@ from sqn_jax.lock import locked
 from sqn_jax.manifest import Manifest, Origin
 from sqn_jax.maps import load_map, split_names
 from sqn_jax.progress import episodes_bar
-from sqn_jax.runlog import SUMMARY, RunFolder, write_json, write_records
+from sqn_jax.runlog import CHECKPOINTS, SUMMARY, RunFolder, write_json, write_records
 from sqn_jax.signals import Interrupted, collected
 from sqn_jax.tensorboard import Board, require_tensorboard
 from sqn_jax.train import (
@@ -163,15 +163,13 @@ def _restored(
 
 def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
     """Refuse to start from the beginning where there must have been checkpoints."""
-    place = folder.path / FOLDER
-    rows = folder.read_metrics()
-    seconds = float(rows[-1].get("wall_seconds") or 0.0) if rows else 0.0
+    place = folder.path / CHECKPOINTS
     is_odd = os.path.lexists(place) and not place.is_dir()
     if (
         is_odd
         or any(place.glob("*.damaged"))
         or (folder.path / SUMMARY).exists()
-        or seconds > 120 * config.checkpoint_minutes
+        or folder.train_seconds() > 120 * config.checkpoint_minutes
     ):
         raise ValueError(
             f"{place}: holds no checkpoint that can be used, but the run has been further; put "
@@ -205,10 +203,9 @@ class _Training:
     ) -> None:
         self._env_params, self._config, self._mesh = env_params, config, mesh
         self._folder, self._checkpoints = folder, checkpoints
-        rows = folder.read_metrics()
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
-            "train_seconds": float(rows[-1].get("wall_seconds") or 0.0) if rows else 0.0,
+            "train_seconds": folder.train_seconds(),
             "env_steps": 0.0,
             "num_devices": 1 if mesh is None else mesh.size,
             "compile_seconds": 0.0,

@@ -155,27 +155,16 @@ def _drive(
     )
 
 
-def flat_config(config: TrainConfig) -> dict[str, Any]:
-    """Every setting by its name, `learner.discount` for one of a group."""
-    flat: dict[str, Any] = {}
-    for name, value in configs.to_dict(config).items():
-        if isinstance(value, dict):
-            flat |= {f"{name}.{inner}": each for inner, each in value.items()}
-        else:
-            flat[name] = value
-    return flat
-
-
 def changed_settings(config: TrainConfig) -> tuple[str, list[tuple[str, Any, Any]]]:
     """The preset that a config is nearest to, and where it differs.
 
     Returns:
         Name of the preset; name, value and the preset's value of each setting that differs.
     """
-    ours = flat_config(config)
+    ours = configs.flat(configs.to_dict(config))
     changes = {}
     for preset, defaults in PRESETS.items():
-        theirs = flat_config(defaults)
+        theirs = configs.flat(configs.to_dict(defaults))
         changes[preset] = [
             (name, ours[name], theirs[name]) for name in ours if ours[name] != theirs[name]
         ]
