@@ -14,8 +14,11 @@ from jax import Array
 from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import draw_exploration, epsilon_greedy
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
+from sqn_jax.agent.shares import own_share
+from sqn_jax.config import RandomizationConfig
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
+from sqn_jax.env.randomize import randomized, robot_axes, robots_own
 
 
 @struct.dataclass
@@ -52,9 +55,18 @@ class Fleet:
     """[N, H] recurrent state of their network."""
 
 
+def own_worlds(
+    env_params: EnvParams, config: RandomizationConfig, num_envs: int, axis_name: str | None
+) -> EnvParams:
+    """The worlds of N robots, or of this device's share of them."""
+    worlds = randomized(env_params, config, num_envs)
+    own = {name: own_share(getattr(worlds, name), axis_name) for name in robots_own(worlds)}
+    return dataclasses.replace(worlds, **own)
+
+
 def start_fleet(keys: Array, network: QNetwork, env_params: EnvParams) -> Fleet:
     """Start an episode for each of the keys [N], which are consumed."""
-    obs, state = jax.vmap(navigation.reset, in_axes=(0, None))(keys, env_params)
+    obs, state = jax.vmap(navigation.reset, in_axes=(0, robot_axes(env_params)))(keys, env_params)
     return Fleet(obs=obs, state=state, carry=initial_carry(network.config, keys.shape[0]))
 
 
@@ -110,7 +122,7 @@ def unroll(
         params: its parameters.
         fleet: the robots.
         epsilon: [N] probabilities of a random action; 0 is greedy.
-        env_params: the world.
+        env_params: the world, or one for each robot (`env.randomize`).
 
     Returns:
         The robots afterwards, the steps for the learner, and the trace for statistics and
@@ -155,7 +167,7 @@ def act_and_step(
     carry, output = network.apply(params, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
     output = jax.tree.map(lambda x: x[0], output)
     action = epsilon_greedy(output.q_values, epsilon, coins, random_actions)
-    step = jax.vmap(navigation.step, in_axes=(0, 0, 0, None))
+    step = jax.vmap(navigation.step, in_axes=(0, 0, 0, robot_axes(env_params)))
     obs, state, reward, terminated, _, info = step(step_keys, fleet.state, action, env_params)
     emitted = (fleet.obs, fleet.state.pose, action, (reward, terminated, info), output)
     return Fleet(obs=obs, state=state, carry=carry), emitted

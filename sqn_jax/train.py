@@ -40,6 +40,7 @@ from sqn_jax.rollout import (
     Trace,
     draw_chance,
     join_windows,
+    own_worlds,
     restart_at_goal,
     start_fleet,
     summarize,
@@ -166,6 +167,7 @@ def train_round(
     progress = runner.round / config.num_rounds
     epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
     epsilon = own_share(epsilon, axis_name)
+    env_params = own_worlds(env_params, config.randomization, config.num_envs, axis_name)
     fleet_keys = own_share(jax.random.split(fleet_key, config.num_envs), axis_name)
     fleet = start_fleet(fleet_keys, network_of(config), env_params)
     discount = discount_schedule(progress, config.learner)

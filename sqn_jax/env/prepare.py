@@ -82,7 +82,7 @@ def make_env(
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
     width_m, height_m = occupancy_map.tile_m
     middles = positions.mean(axis=1)
-    groups = _groups(occupancy_map.tile_of(middles))
+    groups = _groups(occupancy_map.part_of(middles))
     return EnvParams(
         sight=_ray_grid(
             occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
@@ -195,13 +195,13 @@ def _ray_grid(
     )
 
 
-def _groups(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each point, given by its tile [S], the first of its tile and how many these are, [S, 2].
+def _groups(parts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each point, given by its part [S], the first of its part and how many these are, [S, 2].
 
-    Points of a tile stand one after the other.
+    Points of a part stand one after the other.
     """
     _, firsts, own, counts = np.unique(
-        tiles, return_index=True, return_inverse=True, return_counts=True
+        parts, return_index=True, return_inverse=True, return_counts=True
     )
     return np.stack([firsts[own], counts[own]], axis=1)
 

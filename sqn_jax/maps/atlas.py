@@ -1,6 +1,7 @@
 """Several maps side by side in one, so that one program trains on all of them.
 
-Every map has a closed border: a robot never leaves its own, and never sees another.
+Every map has a closed border: a robot never leaves its own, and never sees another. The area seen
+is counted within a tile, the size of the largest map; smaller ones share tiles with their like.
 """
 
 from __future__ import annotations
@@ -15,49 +16,79 @@ from sqn_jax.maps.occupancy import OccupancyMap, close_border
 
 
 def side_by_side(maps: Sequence[OccupancyMap], name: str) -> OccupancyMap:
-    """Lay maps out as tiles of equal size, as nearly square as may be, row by row from below.
+    """Lay maps out in tiles as large as the largest, nearly square, row by row from below.
 
     Args:
-      maps: at least one; cells of one size. What a smaller one leaves of its tile is occupied.
+      maps: at least one; cells of one size. What they leave of a tile is occupied.
       name: of the whole.
 
     Returns:
-      One map with `tiles`, and the points of all. Episodes take as long as the longest one's.
+      One map with `tiles` and `parts`, one a map in their order, and the points of all. Episodes
+      take as long as the longest one's.
 
     Raises:
       ValueError: no map, or cells of different sizes.
     """
     if not maps:
         raise ValueError(f"map {name}: no map to lay out, expected at least one")
+    resolution = maps[0].resolution
     for each in maps:
-        if each.resolution != maps[0].resolution:
+        if each.resolution != resolution:
             raise ValueError(
-                f"map {name}: {maps[0].name} has cells of {maps[0].resolution:g} m and {each.name} "
+                f"map {name}: {maps[0].name} has cells of {resolution:g} m and {each.name} "
                 f"of {each.resolution:g} m, expected one size"
             )
     if len(maps) == 1:
         return dataclasses.replace(maps[0], name=name)
     height, width = (max(each.shape[axis] for each in maps) for axis in (0, 1))
-    columns = math.ceil(math.sqrt(len(maps)))
-    rows = math.ceil(len(maps) / columns)
+    places, count = _places([each.shape for each in maps], (height, width))
+    columns, rows = _layout(count)
     occupied = np.ones((rows * height, columns * width), dtype=bool)
-    spawn, evaluation = [], []
-    for index, each in enumerate(maps):
-        row, column = divmod(index, columns)
-        top, left = row * height, column * width
+    spawn, evaluation, parts = [], [], []
+    for each, (tile, row, column) in zip(maps, places, strict=True):
+        top, left = tile // columns * height + row, tile % columns * width + column
         own = close_border(each.occupied)
         occupied[top : top + own.shape[0], left : left + own.shape[1]] = own
-        corner = np.array([left, top]) * each.resolution
+        corner = np.array([left, top]) * resolution
         spawn.append(each.spawn_points + corner)
         evaluation.append(each.evaluation_points + corner)
+        parts.append((*corner.tolist(), *(corner + each.size_m).tolist()))
     return OccupancyMap(
         name=name,
         occupied=occupied,
-        resolution=maps[0].resolution,
+        resolution=resolution,
         spawn_points=np.concatenate(spawn),
         evaluation_points=np.concatenate(evaluation),
         spawn_radius=max(each.spawn_radius for each in maps),
         max_steps=max(each.max_steps for each in maps),
         warnings=tuple(line for each in maps for line in each.warnings),
         tiles=(columns, rows),
+        parts=tuple(parts),
     )
+
+
+def _places(
+    shapes: Sequence[tuple[int, int]], tile: tuple[int, int]
+) -> tuple[list[tuple[int, int, int]], int]:
+    """For each map its tile, and its lowest row and first column there; and the number of tiles.
+
+    Maps of one shape fill a tile before they begin another.
+    """
+    left: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+    places, count = [], 0
+    for height, width in shapes:
+        free = left.setdefault((height, width), [])
+        if not free:
+            down, across = tile[0] // height, tile[1] // width
+            free += [(count, i * height, j * width) for i in range(down) for j in range(across)]
+            count += 1
+        places.append(free.pop(0))
+    return places, count
+
+
+def _layout(count: int) -> tuple[int, int]:
+    """Columns and rows for so many tiles: the fewest in all, at most twice as wide as high."""
+    square = math.ceil(math.sqrt(count))
+    layouts = [(columns, math.ceil(count / columns)) for columns in range(square, 2 * square)]
+    fitting = [(columns, rows) for columns, rows in layouts if columns <= max(square, 2 * rows)]
+    return min(fitting, key=lambda layout: layout[0] * layout[1])

@@ -36,8 +36,10 @@ class OccupancyMap:
       spawn_radius: m; starts are drawn from free cells this near to a spawn point.
       max_steps: length of an episode.
       warnings: what the loader found odd, one line each.
-      tiles: (columns, rows) of maps of equal size laid side by side in this one (`maps.atlas`);
-        only points in the same tile reach each other.
+      tiles: (columns, rows) of tiles of equal size, if several maps lie side by side in this one
+        (`maps.atlas`); none of them crosses the border of a tile.
+      parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
+        points in the same part reach each other.
     """
 
     name: str
@@ -50,6 +52,7 @@ class OccupancyMap:
     max_steps: int = 400
     warnings: tuple[str, ...] = ()
     tiles: tuple[int, int] = (1, 1)
+    parts: tuple[tuple[float, float, float, float], ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -69,12 +72,13 @@ class OccupancyMap:
         width, height = self.size_m
         return width / self.tiles[0], height / self.tiles[1]
 
-    def tile_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """The tile [...] of points [..., 2] in the grid frame, counted row by row from below."""
-        column, row = np.moveaxis(
-            np.floor(np.asarray(points, dtype=np.float64) / self.tile_m).astype(np.int64), -1, 0
-        )
-        return row * self.tiles[0] + column
+    def part_of(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Which part [...] points [..., 2] in the grid frame lie in: 0 in one map alone."""
+        xy = np.asarray(points, dtype=np.float64)[..., None, :]
+        boxes = np.array(self.parts or [(0.0, 0.0, *self.size_m)])
+        inside = (xy >= boxes[:, :2]) & (xy < boxes[:, 2:])
+        part: NDArray[np.int64] = inside.all(axis=-1).argmax(axis=-1)
+        return part
 
     def identity(self) -> dict[str, Any]:
         """What tells this map from another: its size, and a SHA-256 of all that decides a task."""
@@ -245,9 +249,9 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
             raise ValueError(
                 f"{where} is too near an obstacle, expected {robot_radius:g} m (the robot's radius)"
             )
-        found.append((name, int(labels[row, col]), int(occupancy_map.tile_of(point))))
-    for tile in sorted({tile for _, _, tile in found}):
-        _require_connected([each[:2] for each in found if each[2] == tile], source)
+        found.append((name, int(labels[row, col]), int(occupancy_map.part_of(point))))
+    for part in sorted({part for _, _, part in found}):
+        _require_connected([each[:2] for each in found if each[2] == part], source)
 
 
 def _require_connected(found: list[tuple[str, int]], source: str) -> None:
@@ -266,10 +270,10 @@ def _require_connected(found: list[tuple[str, int]], source: str) -> None:
 def reachable_cells(occupancy_map: OccupancyMap, robot_radius: float) -> NDArray[np.bool_]:
     """The connected component, bool [H, W], of traversable cells that holds the spawn points.
 
-    Of a map with several tiles, that of each.
+    Of several maps side by side, that of each.
     """
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
     labels, _ = connected_components(free)
-    _, firsts = np.unique(occupancy_map.tile_of(occupancy_map.spawn_points), return_index=True)
+    _, firsts = np.unique(occupancy_map.part_of(occupancy_map.spawn_points), return_index=True)
     rows, cols = points_to_cells(occupancy_map.spawn_points[firsts], occupancy_map.resolution).T
     return np.isin(labels, labels[rows, cols]) & free

@@ -39,11 +39,11 @@ def test_every_map_lies_in_its_tile_with_its_points(
     assert atlas.max_steps == 400
     for field in ("spawn_points", "evaluation_points"):
         points = getattr(atlas, field)
-        tiles = atlas.tile_of(points)
+        parts = atlas.part_of(points)
         for index, each in enumerate(maps):
             rows, columns, corner = tile(atlas, index)
             np.testing.assert_array_equal(atlas.occupied[rows, columns], each.occupied)
-            np.testing.assert_allclose(points[tiles == index] - corner, getattr(each, field))
+            np.testing.assert_allclose(points[parts == index] - corner, getattr(each, field))
     assert atlas.occupied[340:, 680:].all()  # The sixth tile is empty.
     validate(atlas, 0.1)
 
@@ -88,6 +88,39 @@ def test_smaller_maps_leave_the_rest_of_their_tile_occupied(maps: list[Occupancy
     np.testing.assert_array_equal(both.occupied[:340, :340], maps[0].occupied)
     assert both.occupied[340:, :1020].all()
     np.testing.assert_array_equal(both.occupied[:, 1020:], cave.occupied)
+
+
+def test_small_maps_share_the_tiles_of_a_large_one() -> None:
+    """Nine mazes of 17 m fit into a tile of 51 m; the tenth begins another."""
+    mazes = [generate("maze", seed) for seed in range(10)]
+    cave = generate("cave", 0)
+    mixed = side_by_side([*mazes[:5], cave, *mazes[5:]], "mixed")
+    assert mixed.tiles == (2, 2)
+    assert mixed.tile_m == (51.0, 51.0)
+    validate(mixed, 0.1)
+    kept = []
+    for index, each in enumerate([*mazes[:5], cave, *mazes[5:]]):
+        left, bottom, right, top = np.round(np.array(mixed.parts[index]) / 0.05).astype(int)
+        assert (top - bottom, right - left) == each.shape
+        assert left // 1020 == (right - 1) // 1020  # It crosses no border of a tile,
+        assert bottom // 1020 == (top - 1) // 1020  # neither way.
+        np.testing.assert_array_equal(mixed.occupied[bottom:top, left:right], each.occupied)
+        mine = mixed.spawn_points[mixed.part_of(mixed.spawn_points) == index]
+        np.testing.assert_allclose(mine - [left * 0.05, bottom * 0.05], each.spawn_points)
+        kept.append((bottom // 1020, left // 1020))
+    assert len(set(kept[:5] + kept[6:10])) == 1  # Nine mazes in one tile,
+    assert len(set(kept)) == 3  # the cave and the tenth maze in others.
+    free = sum((~each.occupied).sum() for each in [*mazes, cave])
+    assert (~mixed.occupied).sum() == free  # Nothing else is free, nothing lies on another.
+
+
+def test_the_sheet_is_nearly_square_and_hardly_larger_than_its_maps() -> None:
+    small = generate("maze", 0)
+    for count in range(2, 40):
+        copies = [dataclasses.replace(small, name=str(index)) for index in range(count)]
+        columns, rows = side_by_side(copies, "many").tiles
+        assert count <= columns * rows <= count + 1 + count // 6
+        assert rows <= columns <= 2 * rows
 
 
 def test_what_cannot_be_laid_out_is_refused(maps: list[OccupancyMap]) -> None:

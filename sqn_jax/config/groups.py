@@ -1,23 +1,10 @@
-"""Every setting of a run, as frozen dataclasses that check themselves.
-
-A config is static: it is hashable, decides shapes and branches, and is passed to jitted functions
-as a static argument. Numbers that one might sweep inside one program (speeds, noise, reward
-weights) are copied from `EnvConfig` into the traced `EnvParams` when an environment is made.
-
-The defaults follow the paper (section IV-D); where it is silent, docs/ARCHITECTURE.md states the
-value chosen and why. The other presets stand in `presets.py`.
-"""
+"""The groups of settings: robot, world, network, replay, learner, exploration, evaluation."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
-import types
-import typing
-from dataclasses import dataclass, field, fields
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 from sqn_jax.checks import (
     require,
@@ -25,9 +12,6 @@ from sqn_jax.checks import (
     require_not_negative,
     require_positive,
 )
-
-Algorithm = Literal["sqn", "r2d2", "dqn"]
-Method = Literal["r2d2", "pqn"]
 
 
 @dataclass(frozen=True)
@@ -108,6 +92,26 @@ class EnvConfig:
             "a positive multiple of 4",
         )
         require(self.ray_iterations >= 1, "env.ray_iterations", self.ray_iterations, "at least 1")
+
+
+@dataclass(frozen=True)
+class RandomizationConfig:
+    """How the worlds of the parallel robots differ in training (domain randomisation).
+
+    Each robot keeps its own world for the whole run. Evaluations have none of this.
+    """
+
+    velocity_noise: float = 0.0
+    """Sigma of each robot's velocity noise, from 0 to this; in place of `env.velocity_noise`."""
+    range_noise: float = 0.0
+    """Half-width of each robot's range noise, from 0 to this; in place of `env.range_noise`."""
+    speed: float = 0.0
+    """Each robot's speeds and turn rate are up to this share faster or slower."""
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_noise", "range_noise"):
+            require_not_negative(self, "randomization", name)
+        require(0 <= self.speed <= 1, "randomization.speed", self.speed, "a number from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -248,151 +252,3 @@ class EvalConfig:
     def __post_init__(self) -> None:
         require(self.episodes >= 1, "eval.episodes", self.episodes, "at least 1")
         require(self.seed >= 0, "eval.seed", self.seed, "0 or a positive number")
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """One training run."""
-
-    algo: Algorithm = "sqn"
-    """The agent, named as in the paper by its network."""
-    method: Method = "r2d2"
-    """How it learns: R2D2 with replay, or recurrent PQN on fresh episodes."""
-    map: str = "maze"
-    """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
-    ("maze:7"), or several side by side, "maze,maze:0-14"; evaluated is the first."""
-    seed: int = 0
-    """Seed of the first run."""
-    num_seeds: int = 1
-    """Runs trained side by side in one program, with seeds seed, seed + 1, ..."""
-    total_episodes: int = 10_000
-    """Training episodes of each run."""
-    num_envs: int = 50
-    """Robots that drive side by side; each round is one whole episode of all of them."""
-    updates_per_round: int = 50
-    """r2d2: updates after each round."""
-    rounds_per_chunk: int = 1
-    """Rounds in one call of the compiled program; the host looks in between chunks."""
-    checkpoint_minutes: float = 10.0
-    """Minutes between checkpoints; one is always written at the end."""
-    checkpoint_replay: bool = True
-    """r2d2: save the replay, too; else a run goes on from an empty one, not as it would have."""
-    max_skipped_updates: int = 100
-    """Stop once more updates than this had a loss or gradient that is not finite."""
-    env: EnvConfig = field(default_factory=EnvConfig)
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    learner: LearnerConfig = field(default_factory=LearnerConfig)
-    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
-    eval: EvalConfig = field(default_factory=EvalConfig)
-
-    def __post_init__(self) -> None:
-        require_known_words(self, "")
-        require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
-        for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
-            value = getattr(self, name)
-            require(value >= 1, name, value, "at least 1")
-        require(
-            self.total_episodes >= self.num_envs,
-            "total_episodes",
-            self.total_episodes,
-            f"at least num_envs ({self.num_envs}), one round",
-        )
-        most = 10**9
-        require(self.total_episodes <= most, "total_episodes", self.total_episodes, f"up to {most}")
-        require_positive(self, "", "checkpoint_minutes")
-        require_not_negative(self, "", "max_skipped_updates")
-        if self.method == "r2d2":
-            require(
-                self.replay.capacity % self.num_envs == 0,
-                "replay.capacity",
-                self.replay.capacity,
-                f"a multiple of num_envs ({self.num_envs}), which are stored a round at a time",
-            )
-        else:
-            require(
-                self.num_envs % self.learner.batch_size == 0,
-                "learner.batch_size",
-                self.learner.batch_size,
-                f"a divisor of num_envs ({self.num_envs}) under the method pqn",
-            )
-
-    @property
-    def num_rounds(self) -> int:
-        """Rounds of the whole run; the last chunk may add a few to be full."""
-        rounds = math.ceil(self.total_episodes / self.num_envs)
-        return math.ceil(rounds / self.rounds_per_chunk) * self.rounds_per_chunk
-
-    @property
-    def num_chunks(self) -> int:
-        """Calls of the compiled program in the whole run."""
-        return self.num_rounds // self.rounds_per_chunk
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """Return a config as nested plain dicts, ready for JSON."""
-    return dataclasses.asdict(config)
-
-
-def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names, `learner.discount` for one of a group."""
-    named: dict[str, Any] = {}
-    for name, value in tree.items():
-        label = f"{prefix}{name}"
-        named |= flat(value, f"{label}.") if isinstance(value, dict) else {label: value}
-    return named
-
-
-def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
-    """Rebuild a config from `to_dict`'s output.
-
-    Raises:
-        ValueError: an unknown field, a value of the wrong type, or one out of range; the message
-            names the field.
-    """
-    require(isinstance(data, dict), prefix.rstrip(".") or "config", data, "a mapping of fields")
-    known = {item.name: item for item in fields(cls)}
-    hints = typing.get_type_hints(cls)
-    values = {}
-    for name, value in data.items():
-        require(name in known, f"{prefix}{name}", value, f"one of the fields {sorted(known)}")
-        if dataclasses.is_dataclass(hints[name]):
-            value = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
-        else:
-            value = _checked(value, hints[name], f"{prefix}{name}")
-        values[name] = value
-    return cls(**values)
-
-
-def _checked(value: Any, hint: Any, label: str) -> Any:
-    """Check one leaf against its annotation; whole numbers pass where a float is asked for."""
-    if typing.get_origin(hint) is Literal:
-        return value  # The dataclass checks its words itself.
-    assert not isinstance(hint, types.UnionType), "config fields have one type"
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    require(type(value) is hint, label, value, f"a value of type {hint.__name__}")
-    return value
-
-
-def save(config: TrainConfig, path: Path) -> None:
-    """Write a config as JSON."""
-    path.write_text(json.dumps(to_dict(config), indent=2) + "\n", encoding="utf-8")
-
-
-def load(path: Path) -> TrainConfig:
-    """Read a config written by `save`.
-
-    Raises:
-        ValueError: the file is missing, is not JSON, or holds an unusable value.
-    """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from None
-    try:
-        return typing.cast(TrainConfig, from_dict(data))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None

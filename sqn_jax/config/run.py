@@ -1,0 +1,106 @@
+"""All settings of a run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sqn_jax.checks import (
+    require,
+    require_known_words,
+    require_not_negative,
+    require_positive,
+)
+from sqn_jax.config.groups import (
+    EnvConfig,
+    EvalConfig,
+    ExplorationConfig,
+    LearnerConfig,
+    NetworkConfig,
+    RandomizationConfig,
+    ReplayConfig,
+)
+
+Algorithm = Literal["sqn", "r2d2", "dqn"]
+Method = Literal["r2d2", "pqn"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    algo: Algorithm = "sqn"
+    """The agent, named as in the paper by its network."""
+    method: Method = "r2d2"
+    """How it learns: R2D2 with replay, or recurrent PQN on fresh episodes."""
+    map: str = "maze"
+    """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
+    ("maze:7"), or several side by side, "maze,maze:0-14"; evaluated is the first."""
+    seed: int = 0
+    """Seed of the first run."""
+    num_seeds: int = 1
+    """Runs trained side by side in one program, with seeds seed, seed + 1, ..."""
+    total_episodes: int = 10_000
+    """Training episodes of each run."""
+    num_envs: int = 50
+    """Robots that drive side by side; each round is one whole episode of all of them."""
+    updates_per_round: int = 50
+    """r2d2: updates after each round."""
+    rounds_per_chunk: int = 1
+    """Rounds in one call of the compiled program; the host looks in between chunks."""
+    checkpoint_minutes: float = 10.0
+    """Minutes between checkpoints; one is always written at the end."""
+    checkpoint_replay: bool = True
+    """r2d2: save the replay, too; else a run goes on from an empty one, not as it would have."""
+    max_skipped_updates: int = 100
+    """Stop once more updates than this had a loss or gradient that is not finite."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    eval: EvalConfig = field(default_factory=EvalConfig)
+
+    def __post_init__(self) -> None:
+        require_known_words(self, "")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
+        for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
+            value = getattr(self, name)
+            require(value >= 1, name, value, "at least 1")
+        require(
+            self.total_episodes >= self.num_envs,
+            "total_episodes",
+            self.total_episodes,
+            f"at least num_envs ({self.num_envs}), one round",
+        )
+        most = 10**9
+        require(self.total_episodes <= most, "total_episodes", self.total_episodes, f"up to {most}")
+        require_positive(self, "", "checkpoint_minutes")
+        require_not_negative(self, "", "max_skipped_updates")
+        if self.method == "r2d2":
+            require(
+                self.replay.capacity % self.num_envs == 0,
+                "replay.capacity",
+                self.replay.capacity,
+                f"a multiple of num_envs ({self.num_envs}), which are stored a round at a time",
+            )
+        else:
+            require(
+                self.num_envs % self.learner.batch_size == 0,
+                "learner.batch_size",
+                self.learner.batch_size,
+                f"a divisor of num_envs ({self.num_envs}) under the method pqn",
+            )
+
+    @property
+    def num_rounds(self) -> int:
+        """Rounds of the whole run; the last chunk may add a few to be full."""
+        rounds = math.ceil(self.total_episodes / self.num_envs)
+        return math.ceil(rounds / self.rounds_per_chunk) * self.rounds_per_chunk
+
+    @property
+    def num_chunks(self) -> int:
+        """Calls of the compiled program in the whole run."""
+        return self.num_rounds // self.rounds_per_chunk

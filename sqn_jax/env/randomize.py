@@ -1,0 +1,69 @@
+"""Domain randomisation: a world of its own for each of N robots (paper section V, future work)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sqn_jax.config import RandomizationConfig
+from sqn_jax.env.params import EnvParams
+
+
+def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) -> EnvParams:
+    """The worlds of N robots: their noise and their speeds are spread evenly and independently.
+
+    Robot n always has the same world, whatever the seed.
+
+    Args:
+        params: the common world.
+        config: how far it is spread.
+        num_envs: N.
+
+    Returns:
+        Parameters in which each field that differs has a leading axis [N]; see `robot_axes`.
+    """
+    shares = _spread(num_envs)
+    given = params.config
+    changes: dict[str, Any] = {}
+    if config.velocity_noise > 0:
+        speed = np.array([given.forward_speed, given.turn_rate])
+        unit = speed if given.velocity_noise_unit == "relative" else np.ones(2)
+        changes["velocity_noise"] = jnp.asarray(
+            config.velocity_noise * shares[:, :1] * unit, jnp.float32
+        )
+        given = dataclasses.replace(given, velocity_noise=config.velocity_noise)
+    if config.range_noise > 0:
+        changes["range_noise"] = jnp.asarray(config.range_noise * shares[:, 1], jnp.float32)
+        given = dataclasses.replace(given, range_noise=config.range_noise)
+    if config.speed > 0:
+        factors = jnp.asarray(1 + config.speed * (2 * shares[:, 2] - 1), jnp.float32)
+        changes["commands"] = factors[:, None, None] * params.commands
+    return dataclasses.replace(params, config=given, **changes)
+
+
+def robots_own(params: EnvParams) -> list[str]:
+    """The fields in which each robot has something of its own."""
+    common = {"commands": 2, "velocity_noise": 1, "range_noise": 0}
+    return [name for name, rank in common.items() if jnp.ndim(getattr(params, name)) > rank]
+
+
+def robot_axes(params: EnvParams) -> Any:
+    """For `jax.vmap` over N robots: axis 0 for what each has of its own, None for the rest."""
+    shared = jax.tree.map(lambda _: None, params)
+    return dataclasses.replace(shared, **dict.fromkeys(robots_own(params), 0))
+
+
+def _spread(count: int) -> NDArray[np.float64]:
+    """[N, 3] numbers in 0..1 that fill the cube evenly, as those of any run of them do.
+
+    The additive recurrence of Roberts' R3 sequence: multiples of powers of 1/g, g^4 = g + 1.
+    """
+    ratio = 1.22074408460575947536
+    steps = ratio ** -np.arange(1.0, 4.0)
+    spread: NDArray[np.float64] = (0.5 + np.arange(count)[:, None] * steps) % 1.0
+    return spread
