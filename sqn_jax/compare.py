@@ -20,7 +20,8 @@ from sqn_jax import evaluate, navigators, scores
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.env.prepare import with_noise
-from sqn_jax.maps import OccupancyMap, goal_fields, load_map, points_to_cells, traversable
+from sqn_jax.maps import OccupancyMap, load_map
+from sqn_jax.planners import shortest_ways
 from sqn_jax.policies import Policy
 from sqn_jax.rollout import EpisodeSummary, Trace, summarize
 from sqn_jax.scores import Outcome
@@ -285,11 +286,18 @@ def evaluate_agents(
     for robot in dict.fromkeys(robots.values()):
         ways: dict[bytes, NDArray[np.float64]] = {}
         for world in worlds(robot, maps, settings):
-            for agent in (agent for agent in agents if robots[agent.name] == robot):
-                outcomes = _outcomes(agent, world, settings, ways, on_batch, on_driven)
+            drivers = [agent for agent in agents if robots[agent.name] == robot]
+            driven = {
+                agent.name: _outcomes(agent, world, settings, ways, on_batch, on_driven)
+                for agent in drivers
+            }
+            for agent in drivers:
+                outcomes = driven[agent.name]
                 for radius, of_radius in outcomes.items():
                     labels = _labels(agent, world, radius)
-                    results.append({**labels, **_entry(agent, settings, of_radius)})
+                    oracle = driven["oracle"][radius] if "oracle" in driven else None
+                    told = scores.describe(of_radius, oracle)
+                    results.append({**labels, **_drivers(agent, settings), **told})
                     records += scores.records(of_radius, **labels)
                 if world.noise == (0.0, 0.0):
                     quiet[agent.name].append(outcomes[settings.goal_radii[0]])
@@ -342,7 +350,7 @@ def _outcomes(
             starts, goals = np.asarray(trace.poses[0]), np.asarray(trace.goals)
             tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
             if tasks not in ways:
-                ways[tasks] = shortest_ways(world, starts, goals)
+                ways[tasks] = _ways(world, starts, goals)
             for radius, summary in zip(settings.goal_radii, summaries, strict=True):
                 outcomes[radius].append(
                     Outcome(training_seed, eval_seed, summary, starts, goals, ways[tasks])
@@ -350,23 +358,16 @@ def _outcomes(
     return outcomes
 
 
+def _ways(
+    world: World, starts: NDArray[np.floating], goals: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    robot_radius = world.env_params.config.robot_radius
+    return shortest_ways(world.occupancy_map, starts, goals, robot_radius=robot_radius)
+
+
 def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
     """The key of the episodes of an evaluation seed; every agent gets the same."""
     return jax.random.fold_in(jax.random.key(eval_seed), list(SPAWN_MODES).index(tasks))
-
-
-def shortest_ways(
-    world: World, starts: NDArray[np.floating], goals: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Length of the shortest way from each start [E, 3] to its goal [E, 2], m."""
-    occupancy_map = world.occupancy_map
-    resolution = occupancy_map.resolution
-    free = traversable(occupancy_map.occupied, resolution, world.env_params.config.robot_radius)
-    row, col = points_to_cells(starts[:, :2], resolution).T
-    lengths = np.empty(len(goals))
-    for same, field in goal_fields(free, resolution, goals):
-        lengths[same] = field[row[same], col[same]]
-    return lengths
 
 
 def _eval_seeds(settings: Settings) -> list[int]:
@@ -388,10 +389,9 @@ def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
     }
 
 
-def _entry(agent: Agent, settings: Settings, outcomes: list[Outcome]) -> dict[str, Any]:
+def _drivers(agent: Agent, settings: Settings) -> dict[str, Any]:
     return {
         "training_seeds": list(agent.training_seeds),
         "eval_seeds": _eval_seeds(settings),
         "episodes": settings.episodes,
-        **scores.describe(outcomes),
     }

@@ -33,6 +33,23 @@ BEND_SLACK = 0.1
 """rad; smaller bends come from the grid's few directions, not from the map."""
 
 
+def shortest_ways(
+    occupancy_map: OccupancyMap,
+    starts: NDArray[np.floating],
+    goals: NDArray[np.floating],
+    *,
+    robot_radius: float,
+) -> NDArray[np.float64]:
+    """Length of the shortest way from each start [E, >= 2] to its goal [E, 2], m."""
+    resolution = occupancy_map.resolution
+    free = traversable(occupancy_map.occupied, resolution, robot_radius)
+    row, col = points_to_cells(starts[:, :2], resolution).T
+    lengths = np.empty(len(goals))
+    for same, field in goal_fields(free, resolution, goals):
+        lengths[same] = field[row[same], col[same]]
+    return lengths
+
+
 def move_offsets(step: float, resolution: float) -> NDArray[np.int64]:
     """The whole-cell offset (d_row, d_col) [HEADINGS, 2] nearest to a move of `step` m."""
     angle = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)

@@ -59,15 +59,19 @@ class Outcome:
         return {name: np.asarray(values, np.float64) for name, values in named.items()}
 
 
-def describe(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def describe(
+    outcomes: Sequence[Outcome], oracle: Sequence[Outcome] | None = None
+) -> dict[str, Any]:
     """Statistics over all episodes of an agent in one world, ready for JSON.
 
     Args:
         outcomes: one for each training seed and evaluation seed, of equally many episodes.
+        oracle: those of the oracle on the same tasks, one for each evaluation seed.
 
     Returns:
         `success`, `time_steps` (failures at the limit), `time_steps_success` (None without a
-        success), `spl` (None where no shortest ways are known), `mean_reward`, `collisions`,
+        success), `steps_over_oracle` (of each success over the oracle's in the same task; None
+        without), `spl` (None where no shortest ways are known), `mean_reward`, `collisions`,
         `coverage_m2`: each with the `mean`, the `std` over episodes, a 95 % interval `ci95` over
         episodes (Wilson for `success`, bootstrap for the others) and `std_of_means`, the spread of
         the means of the (training seed, evaluation seed) pairs, which is what the paper gives.
@@ -82,8 +86,22 @@ def describe(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         result[name] = _describe(name, values, outcomes) if len(values) == len(metrics) else None
     steps = [metric["time_steps"][metric["success"] > 0] for metric in metrics]
     result["time_steps_success"] = _over_episodes(np.concatenate(steps))
+    result["steps_over_oracle"] = _over_episodes(_steps_over_oracle(outcomes, oracle or []))
     result["success_per_seed"] = _of_each_seed("success", outcomes)
     return result
+
+
+def _steps_over_oracle(
+    outcomes: Sequence[Outcome], oracle: Sequence[Outcome]
+) -> NDArray[np.float64]:
+    """Steps over the oracle's, of every task in which both arrive."""
+    same = {each.eval_seed: each for each in oracle}
+    ratios = [np.empty(0)]
+    for outcome in (outcome for outcome in outcomes if outcome.eval_seed in same):
+        ours, theirs = outcome.metrics, same[outcome.eval_seed].metrics
+        both = (ours["success"] > 0) & (theirs["success"] > 0)
+        ratios.append(ours["time_steps"][both] / theirs["time_steps"][both])
+    return np.concatenate(ratios)
 
 
 def _describe(
@@ -183,7 +201,7 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
     """
     radii = list(dict.fromkeys(entry["goal_radius"] for entry in results))
     header = ["map", "agent", "noise", *(f"success {radius:g} m" for radius in radii)]
-    header += ["steps", "steps (reached)", "SPL", "collisions", "reward"]
+    header += ["steps", "steps (reached)", "over oracle", "SPL", "collisions", "reward"]
     rows = []
     for entry in (entry for entry in results if entry["goal_radius"] == radii[0]):
         same = [other for other in results if _world_of(other) == _world_of(entry)]
@@ -191,8 +209,9 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
         successes[0] += f" ± {entry['success']['std_of_means']:.2f}"
         tasks = "" if entry["tasks"] == "evaluation points" else f" ({entry['tasks']})"
         cells = [entry["map"] + tasks, entry["agent"], _noise_of(entry), *successes]
-        for name, digits in (("time_steps", 1), ("time_steps_success", 1), ("spl", 2)):
-            told = entry[name]
+        shown = (("time_steps", 1), ("time_steps_success", 1), ("steps_over_oracle", 2), ("spl", 2))
+        for name, digits in shown:
+            told = entry.get(name)
             cells.append("-" if told is None else f"{told['mean']:.{digits}f}")
         cells += [f"{entry['collisions']['mean']:.1f}", f"{entry['mean_reward']['mean']:.2f}"]
         rows.append(cells)

@@ -19,15 +19,12 @@ from sqn_jax.compare import (
     Learnt,
     Reference,
     Settings,
-    World,
     group_policies,
     load_maps,
     num_episodes,
-    shortest_ways,
     with_references,
 )
 from sqn_jax.config import EnvConfig, TrainConfig
-from sqn_jax.env import make_env
 from sqn_jax.maps import (
     OccupancyMap,
     goal_distance,
@@ -36,6 +33,7 @@ from sqn_jax.maps import (
     save_map,
     traversable,
 )
+from sqn_jax.planners import shortest_ways
 from sqn_jax.policies import Policy, load_policy
 
 TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4", "--num-seeds", "2"]
@@ -140,15 +138,13 @@ def test_the_shortest_ways_are_read_off_each_goal_s_own_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     occupancy_map = load_map("maze")
-    env_params = make_env(occupancy_map)
     rng = np.random.default_rng(0)
     places = rng.choice(occupancy_map.spawn_points, 7)
     goals = occupancy_map.spawn_points[[3, 9, 9, 40, 3, 22, 50]]
     starts = np.concatenate([places, np.zeros((7, 1))], axis=1)
     # Two fields at a time, so that the last batch is not full.
     monkeypatch.setattr("sqn_jax.maps.distance.FIELD_CELLS", 2 * 340 * 340)
-    world = World(occupancy_map, env_params, "random pairs", (0.0, 0.0))
-    found = shortest_ways(world, starts, goals)
+    found = shortest_ways(occupancy_map, starts, goals, robot_radius=0.1)
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, 0.1)
     for episode in range(7):
         field = goal_distance(free, occupancy_map.resolution, goals[episode])

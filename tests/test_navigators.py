@@ -14,7 +14,6 @@ from compiling import compiling_quickly
 
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.bug import BugNavigator
-from sqn_jax.compare import World, shortest_ways
 from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import EnvParams, make_env, reset, reset_to, step
 from sqn_jax.env.dynamics import move
@@ -22,7 +21,7 @@ from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluate import episode_keys, run_episodes
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
 from sqn_jax.navigators import BeamSearch, Oracle, drive, run_bug, run_oracle
-from sqn_jax.planners import HEADINGS, Ways, oracle_steps
+from sqn_jax.planners import HEADINGS, Ways, oracle_steps, shortest_ways
 from sqn_jax.statistics import success_weighted_path_length
 
 KEY = jax.random.key(11)
@@ -178,7 +177,7 @@ def test_oracle_reaches_a_goal_from_every_point_of_a_map(name: str) -> None:
         if arrived.all():
             break
     assert arrived.all(), points[~arrived]
-    ways = shortest_ways(World(occupancy_map, world, "random pairs", (0.0, 0.0)), poses, goals)
+    ways = shortest_ways(occupancy_map, poses, goals, robot_radius=0.1)
     assert success_weighted_path_length(arrived, length, ways).mean() > 0.98
 
 

@@ -49,6 +49,26 @@ def test_failures_count_at_the_limit_and_are_left_out_of_the_successes() -> None
     assert "iqm" not in told["success"], "one training seed has no spread over training seeds"
 
 
+def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> None:
+    """Evaluation seeds are told apart, training seeds meet the same oracle."""
+    ours = [
+        outcome(0, 1000, [True, False, True, True]),
+        outcome(1, 1000, [True, True, False, False]),
+        outcome(0, 1001, [True, True, False, False]),
+    ]
+    oracle = [
+        outcome(None, 1001, [True, False, True, True], time_steps=np.array([8, 400, 9, 9])),
+        outcome(None, 1000, [True, True, True, True], time_steps=np.array([5, 10, 20, 40])),
+    ]
+    told = describe(ours, oracle)["steps_over_oracle"]
+    expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
+    assert told["mean"] == pytest.approx(np.mean(expected))
+    assert told["std"] == pytest.approx(np.std(expected))
+    assert describe(ours)["steps_over_oracle"] is None
+    nowhere = outcome(0, 1000, [False] * 4)
+    assert describe([nowhere], oracle)["steps_over_oracle"] is None
+
+
 def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> None:
     told = describe(
         [outcome(0, 1000, [True, True, True, True]), outcome(0, 1001, [True, False, False, True])]

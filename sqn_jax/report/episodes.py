@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.compare import Learnt, World, shortest_ways
+from sqn_jax.compare import Learnt, World
+from sqn_jax.planners import shortest_ways
 from sqn_jax.rollout import EpisodeSummary
 
 Floats = NDArray[np.floating]
@@ -144,7 +145,8 @@ def _ranked(drives: Sequence[Drive], *, success: bool) -> list[tuple[Drive, int]
         moment = 0 if success else -1
         places = np.stack([drives[number].poses[moment, episode] for number, episode in chosen])
         goals = np.stack([drives[number].goals[episode] for number, episode in chosen])
-        for (number, episode), way in zip(chosen, shortest_ways(world, places, goals), strict=True):
+        ways = _ways(world, places, goals)
+        for (number, episode), way in zip(chosen, ways, strict=True):
             drive = drives[number]
             steps = float(drive.summary.time_steps[episode])
             badness = steps / _fewest_steps(drive, way) if success else float(way)
@@ -158,9 +160,16 @@ def _looked_at(drive: Drive, episode: int) -> Hard:
     first = 0 if success else steps // 2
     ends = drive.poses[[0, -1], episode]
     goals = drive.goals[[episode, episode]]
-    way, left = (float(length) for length in shortest_ways(drive.world, ends, goals))
+    way, left = (float(length) for length in _ways(drive.world, ends, goals))
     place = densest_place(drive.poses[first + 1 : steps + 1, episode, :2])
     return Hard(drive, episode, way, 0.0 if success else left, place)
+
+
+def _ways(
+    world: World, places: NDArray[np.floating], goals: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    robot_radius = world.env_params.config.robot_radius
+    return shortest_ways(world.occupancy_map, places, goals, robot_radius=robot_radius)
 
 
 def _fewest_steps(drive: Drive, way: float) -> float:
