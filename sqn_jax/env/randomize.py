@@ -42,7 +42,7 @@ def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) ->
         given = dataclasses.replace(given, range_noise=config.range_noise)
     if config.speed > 0:
         factors = jnp.asarray(1 + config.speed * (2 * shares[:, 2] - 1), jnp.float32)
-        changes["commands"] = factors[:, None, None] * params.commands
+        changes["commands"] = factors[:, None, None] * params.commands[None]
     return dataclasses.replace(params, config=given, **changes)
 
 
@@ -59,11 +59,12 @@ def robot_axes(params: EnvParams) -> Any:
 
 
 def _spread(count: int) -> NDArray[np.float64]:
-    """[N, 3] numbers in 0..1 that fill the cube evenly, as those of any run of them do.
+    """[N, 3] numbers in 0..1, each column evenly spaced and none of them going with another.
 
-    The additive recurrence of Roberts' R3 sequence: multiples of powers of 1/g, g^4 = g + 1.
+    Ranks of the additive recurrence of Roberts' R3 sequence, multiples of powers of 1/g with
+    g^4 = g + 1, which fills the cube evenly.
     """
     ratio = 1.22074408460575947536
-    steps = ratio ** -np.arange(1.0, 4.0)
-    spread: NDArray[np.float64] = (0.5 + np.arange(count)[:, None] * steps) % 1.0
-    return spread
+    sequence = np.arange(count)[:, None] * ratio ** -np.arange(1.0, 4.0) % 1.0
+    ranks = sequence.argsort(axis=0).argsort(axis=0)
+    return (ranks + 0.5) / count
