@@ -80,3 +80,31 @@ def test_every_goal_of_a_map_is_drawn_but_the_start(maps: list[OccupancyMap]) ->
     }
     counts = [len(each.evaluation_points) for each in maps]
     assert len(pairs) == sum(count * (count - 1) for count in counts)
+
+
+def test_a_small_map_in_the_tile_of_a_large_one(maps: list[OccupancyMap]) -> None:
+    """The second maze lies 17 m to the right in a tile of 51 m. Its points of the lattice are
+    others than alone, so areas agree as two counts of the same area do."""
+    second = generate("maze", 4)
+    mixed = make_env(side_by_side([maps[0], second, generate("cave", 0)], "mixed"))
+    alone = make_env(second)
+    assert mixed.tile == (51.0, 51.0)
+    rng = np.random.default_rng(1)
+    places = np.asarray(alone.spawn_positions).reshape(-1, 2)
+    key, areas = jax.random.key(0), []
+    with compiling_quickly():
+        step, reset_to = jax.jit(navigation.step), jax.jit(navigation.reset_to)
+        for _ in range(4):
+            pose = jnp.append(jnp.asarray(rng.choice(places)), rng.uniform(-3, 3))
+            there, corner = pose + jnp.array([17.0, 0, 0]), jnp.array([17.0, 0])
+            obs, state = reset_to(key, pose, pose[:2] + 1.5, alone)
+            obs_there, state_there = reset_to(key, there, pose[:2] + 1.5 + corner, mixed)
+            for action in rng.choice([1, 1, 1, 2, 3, 3], 60):
+                np.testing.assert_allclose(obs_there.ranges, obs.ranges, atol=2e-4)
+                np.testing.assert_allclose(obs_there.goal, obs.goal, atol=1e-5)
+                obs, state, *_, info = step(key, state, action, alone)
+                obs_there, state_there, *_, info_there = step(key, state_there, action, mixed)
+                areas.append((float(info["covered_area"]), float(info_there["covered_area"])))
+    ours, theirs = np.sum(areas, axis=0)
+    assert ours > 50
+    assert abs(ours - theirs) < 0.03 * ours
