@@ -20,11 +20,11 @@ def test_a_run_on_two_rooms_is_evaluated_on_the_first_and_resumed(
     second = write_empty_room(tmp_path / "other").rename(tmp_path / "other" / "second.yaml")
     first = runs.options["map"]
     monkeypatch.chdir(tmp_path)
-    runs.options["map"] = "room.yaml,other/second.yaml"
+    runs.options["map"] = "room.yaml*3,other/second.yaml"
     code, out, err = runs.call("both")
     assert code == 0, err
     config = json.loads((tmp_path / "both" / "config.json").read_text())
-    assert config["map"] == f"{first},{second}"  # Findable from elsewhere.
+    assert config["map"] == f"{first}*3,{second}"  # Findable from elsewhere.
     results = json.loads((tmp_path / "both" / "evaluation.json").read_text())["results"]
     assert {entry["map"] for entry in results} == {"room"}
     monkeypatch.chdir("/")

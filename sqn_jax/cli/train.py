@@ -130,14 +130,15 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
 
 def _with_absolute_map(config: TrainConfig) -> TrainConfig:
     """A map file stays findable when the run is resumed from another folder."""
-    from sqn_jax.maps import split_names
+    from sqn_jax.maps import weighted_names
 
-    names = split_names(config.map)
-    paths = [Path(name) for name in names]
-    if not any(path.suffix and path.exists() for path in paths):
+    names = weighted_names(config.map)
+    files = {name: Path(name).resolve() for name, _ in names if _is_map_file(Path(name))}
+    if not files:
         return config
-    found = [
-        str(path.resolve()) if path.suffix and path.exists() else name
-        for name, path in zip(names, paths, strict=True)
-    ]
-    return dataclasses.replace(config, map=",".join(found))
+    words = [f"{files.get(name, name)}" + f"*{weight}" * (weight > 1) for name, weight in names]
+    return dataclasses.replace(config, map=",".join(words))
+
+
+def _is_map_file(path: Path) -> bool:
+    return bool(path.suffix) and path.exists()

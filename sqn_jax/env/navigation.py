@@ -44,7 +44,8 @@ def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     """
     keys = jax.random.split(key, 7)
     start_key, goal_key, start_place_key, goal_place_key, heading_key, near_key, which_key = keys
-    start_point = jax.random.randint(start_key, (), 0, params.spawn_counts.shape[0])
+    draw = jax.random.randint(start_key, (), 0, params.start_points.shape[0])
+    start_point = params.start_points[draw]
     first, group_size = params.spawn_groups[start_point]
     other = jax.random.randint(goal_key, (), 1, group_size)
     neighbors = params.spawn_neighbors[start_point]

@@ -26,6 +26,9 @@ class EnvParams:
     """[S, M, 2] m: places to start or finish, grouped by spawn point, padded by repetition."""
     spawn_counts: Array
     """[S] int32: how many of the M places of a spawn point are real."""
+    start_points: Array
+    """[D] int32: the spawn points that tasks start from, equally likely; one of a map with a weight
+    comes that often."""
     spawn_groups: Array
     """[S, 2] int32: of the spawn points that reach each other the first, and how many they are; all
     of them, unless the map holds several side by side."""

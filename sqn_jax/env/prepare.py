@@ -82,7 +82,9 @@ def make_env(
     longest_move = (config.forward_speed * (1 + 4 * config.velocity_noise)) * config.time_step
     width_m, height_m = occupancy_map.tile_m
     middles = positions.mean(axis=1)
-    groups = _groups(occupancy_map.part_of(middles))
+    parts = occupancy_map.part_of(middles)
+    groups = _groups(parts)
+    weights = np.array(occupancy_map.weights or (1,))
     return EnvParams(
         sight=_ray_grid(
             occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
@@ -90,6 +92,7 @@ def make_env(
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
         spawn_positions=jnp.asarray(positions, jnp.float32),
         spawn_counts=jnp.asarray(counts, jnp.int32),
+        start_points=jnp.asarray(np.repeat(np.arange(len(parts)), weights[parts]), jnp.int32),
         spawn_groups=jnp.asarray(groups, jnp.int32),
         spawn_neighbors=jnp.asarray(_nearest(middles, groups), jnp.int32),
         near_goal_fraction=jnp.float32(config.near_goal_fraction),

@@ -2,7 +2,7 @@
 
 from sqn_jax.maps.check import describe
 from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
-from sqn_jax.maps.names import load_map, split_names
+from sqn_jax.maps.names import load_map, split_names, weighted_names
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -32,4 +32,5 @@ __all__ = [
     "split_names",
     "traversable",
     "validate",
+    "weighted_names",
 ]

@@ -15,12 +15,15 @@ import numpy as np
 from sqn_jax.maps.occupancy import OccupancyMap, close_border
 
 
-def side_by_side(maps: Sequence[OccupancyMap], name: str) -> OccupancyMap:
+def side_by_side(
+    maps: Sequence[OccupancyMap], name: str, weights: Sequence[int] | None = None
+) -> OccupancyMap:
     """Lay maps out in tiles as large as the largest, nearly square, row by row from below.
 
     Args:
       maps: at least one; cells of one size. What they leave of a tile is occupied.
       name: of the whole.
+      weights: how many times as many tasks each has in training, >= 1; 1 by default.
 
     Returns:
       One map with `tiles` and `parts`, one a map in their order, and the points of all. Episodes
@@ -64,6 +67,7 @@ def side_by_side(maps: Sequence[OccupancyMap], name: str) -> OccupancyMap:
         warnings=tuple(line for each in maps for line in each.warnings),
         tiles=(columns, rows),
         parts=tuple(parts),
+        weights=tuple(weights or [1] * len(maps)),
     )
 
 

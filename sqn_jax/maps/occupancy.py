@@ -40,6 +40,7 @@ class OccupancyMap:
         (`maps.atlas`); none of them crosses the border of a tile.
       parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
         points in the same part reach each other.
+      weights: for each part how many times as many training tasks as its points alone would give.
     """
 
     name: str
@@ -53,6 +54,7 @@ class OccupancyMap:
     warnings: tuple[str, ...] = ()
     tiles: tuple[int, int] = (1, 1)
     parts: tuple[tuple[float, float, float, float], ...] = ()
+    weights: tuple[int, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -85,6 +87,8 @@ class OccupancyMap:
         contents = hashlib.sha256(np.packbits(self.occupied).tobytes())
         for numbers in (self.spawn_points, self.evaluation_points, [self.spawn_radius]):
             contents.update(np.asarray(numbers, dtype="<f8").tobytes())
+        if set(self.weights) - {1}:
+            contents.update(np.asarray(self.weights, dtype="<f8").tobytes())
         return {
             "cells": list(self.shape),
             "resolution": self.resolution,

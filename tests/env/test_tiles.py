@@ -70,6 +70,18 @@ def test_start_and_goal_lie_in_the_same_map_and_every_map_is_visited(
     assert distance.min() > 0
 
 
+def test_a_weight_makes_tasks_more_frequent_and_no_other(maps: list[OccupancyMap]) -> None:
+    """64 and 40 and 40 points, weights 1, 5 and 2: of 344 draws 64, 200 and 80."""
+    weighed = make_env(side_by_side(maps, "three", [1, 5, 2]))
+    sample = jax.jit(jax.vmap(navigation.sample_task, in_axes=(0, None)))
+    poses, goals = sample(jax.random.split(jax.random.key(4), 4000), weighed)
+    tile = np.floor(np.asarray(poses)[:, :2] / 17).astype(int) @ [1, 2]
+    counts = np.array([len(each.spawn_points) for each in maps])
+    expected = counts * [1, 5, 2] / (counts @ [1, 5, 2])
+    np.testing.assert_allclose(np.bincount(tile, minlength=3) / 4000, expected, atol=0.03)
+    assert np.hypot(*(np.asarray(poses)[:, :2] - np.asarray(goals)).T).min() > 0
+
+
 def test_every_goal_of_a_map_is_drawn_but_the_start(maps: list[OccupancyMap]) -> None:
     together = make_env(side_by_side(maps, "three"), spawn="evaluation")
     sample = jax.jit(jax.vmap(navigation.sample_task, in_axes=(0, None)))

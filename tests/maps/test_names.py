@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from map_files import write_room
 
-from sqn_jax.maps import load_map, split_names
+from sqn_jax.maps import load_map, split_names, weighted_names
 from sqn_jax.maps.generate import generate
 
 
@@ -36,6 +36,24 @@ def test_a_file_may_have_a_comma_in_its_name(tmp_path: Path) -> None:
     assert load_map(str(path)).name == "a,b"
 
 
+def test_weights_belong_to_the_maps_they_stand_behind(tmp_path: Path) -> None:
+    word = "maze*8,maze:0-1*3,cave:2, x/y.yaml*10"
+    expected = {"maze": 8, "maze:0": 3, "maze:1": 3, "cave:2": 1, "x/y.yaml": 10}
+    assert dict(weighted_names(word)) == expected
+    assert split_names(word) == list(expected)
+    assert load_map("maze*8,maze:0-1*3").weights == (8, 3, 3)
+    starred = write_room(tmp_path, grey=np.full((60, 60), 254, dtype=np.uint8))
+    starred = starred.rename(tmp_path / "a*2")
+    assert weighted_names(str(starred)) == [(str(starred), 1)]
+
+
+def test_weights_tell_one_training_from_another() -> None:
+    """A run on other weights is another run; weights of 1 are none."""
+    plain, same, other = (load_map(f"maze{w},maze:0").identity() for w in ("", "*1", "*2"))
+    assert plain == same
+    assert plain["contents"] != other["contents"]
+
+
 def test_a_procedural_map_is_that_of_its_seed() -> None:
     for kind in ("maze", "column", "forest"):
         found, made = load_map(f"{kind}:12"), generate(kind, 12)
@@ -60,6 +78,11 @@ def test_several_lie_side_by_side() -> None:
         ("maze,nowhere", ["'nowhere'", "maze"]),
         ("maze:5-3", ["'maze:5-3'", "FIRST-LAST"]),
         ("maze:0-999999999", ["256"]),
+        ("maze*0,maze:1", ["'maze*0'", "1 to 100"]),
+        ("maze,maze:1-2*101", ["'maze:1-2*101'", "1 to 100"]),
+        ("maze*8*8,maze:1", ["unknown map", "maze*8"]),
+        ("maze*,maze:1", ["unknown map", "maze*"]),
+        ("maze*2,maze", ["maze comes twice"]),
         ("maze:0-200,column:0-200", ["402 maps", "at most 256"]),
         ("maze:9999999999", ["unknown map"]),
         ("ocean:3", ["unknown map", "ocean:3"]),
