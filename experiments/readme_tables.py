@@ -42,13 +42,26 @@ def policies() -> str:
 
 
 def seeds() -> str:
-    """All training seeds of the preset `best`: mean success and its spread over them."""
-    return _over_seeds("best_table.json", PAPER_MAPS)
-
-
-def quick_seeds() -> str:
-    """The same for the preset `quick`, on the maps of its record."""
-    return _over_seeds("seeds_table.json", ("maze", "column", "forest"))
+    """All training seeds of the preset `quick`: mean success and its spread over them."""
+    found = recorded("seeds_table.json")
+    agents = list(dict.fromkeys(entry["agent"] for entry in found["results"]))
+    maps = list(dict.fromkeys(entry["map"] for entry in found["results"]))
+    rows = []
+    for agent in agents:
+        scores = [_one(found["results"], agent, name)["success_per_seed"] for name in maps]
+        count = f"{len(scores[0])} seed" + "s" * (len(scores[0]) > 1)
+        cells = [f"{np.mean(each):.2f} ± {np.std(each):.2f}" for each in scores]
+        rows.append([f"{NAMES[agent]}, {count}", *cells])
+    lines = [markdown_table(["", *maps], rows), ""]
+    for told in found["comparisons"]:
+        first, second = told["first"], told["second"]
+        if agents.index(first) < agents.index(second):
+            low, high = told["ci95"]
+            lines.append(
+                f"{NAMES[first]} beats {NAMES[second]} with probability "
+                f"{told['probability']:.2f} [{low:.2f}, {high:.2f}]."
+            )
+    return "\n".join(lines)
 
 
 def noise() -> str:
@@ -86,7 +99,7 @@ def quick() -> str:
     return markdown_table(header, rows)
 
 
-TABLES = {each.__name__: each for each in (policies, seeds, quick_seeds, noise, quick)}
+TABLES = {each.__name__: each for each in (policies, seeds, noise, quick)}
 
 
 def recorded(name: str) -> Any:
@@ -115,35 +128,6 @@ def _success_and_steps(entry: Entry) -> str:
     told = f"{_mean(entry)}, {entry['time_steps']['mean']:.0f}"
     ratio = entry["steps_over_oracle"]
     return told if ratio is None or entry["agent"] == "oracle" else f"{told} ({ratio['mean']:.2f})"
-
-
-def _over_seeds(record: str, maps: tuple[str, ...]) -> str:
-    """Success of each agent over its training seeds, and how likely one beats another."""
-    found = recorded(record)
-    agents = list(dict.fromkeys(entry["agent"] for entry in found["results"]))
-    agents = [
-        agent
-        for agent in agents
-        if _one(found["results"], agent, "maze")["training_seeds"] != [None]
-    ]
-    rows = []
-    for agent in agents:
-        cells = []
-        for name in maps:
-            scores = _one(found["results"], agent, name)["success_per_seed"]
-            cells.append(f"{np.mean(scores):.2f} ± {np.std(scores):.2f}")
-        count = "1 seed" if len(scores) == 1 else f"{len(scores)} seeds"
-        rows.append([f"{NAMES[agent]}, {count}", *cells])
-    lines = [markdown_table(["", *maps], rows)]
-    for told in found["comparisons"]:
-        first, second = told["first"], told["second"]
-        if agents.index(first) < agents.index(second):
-            low, high = told["ci95"]
-            lines.append(
-                f"{NAMES[first]} beats {NAMES[second]} with probability "
-                f"{told['probability']:.2f} [{low:.2f}, {high:.2f}]."
-            )
-    return "\n\n".join([lines[0], "\n".join(lines[1:])]).rstrip()
 
 
 def filled(text: str) -> str:

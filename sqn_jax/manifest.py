@@ -214,10 +214,8 @@ def differences(
         origin: the run.
         shapes: the trees it should hold, as arrays or structs.
     """
-    then, now = (
-        configs.flat(manifest.contents["config"]),
-        configs.flat(configs.to_dict(origin.config)),
-    )
+    then = _settings(manifest.contents["config"])
+    now = configs.flat(configs.to_dict(origin.config))
     rows = [
         (name, _word(then, name), _word(now, name))
         for name in [*now, *(then.keys() - now.keys())]
@@ -246,6 +244,15 @@ def differences(
         for path in sorted(expected.keys() | written.keys())
         if expected.get(path) != written.get(path)
     ]
+
+
+def _settings(told: dict[str, Any]) -> dict[str, Any]:
+    """Settings as they were saved; those that have come since have their defaults, which are to
+    mean what was done before there were any."""
+    try:
+        return configs.flat(configs.to_dict(configs.from_dict(told)))
+    except ValueError:  # There were settings that are no more: they are shown as differences.
+        return configs.flat(told)
 
 
 def wrong_leaf(manifest: Manifest, items: Mapping[str, Any]) -> str | None:

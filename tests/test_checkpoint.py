@@ -319,6 +319,34 @@ def test_settings_that_may_change_do_not_matter(folder: Path, shapes: RunnerStat
         checkpoints.restore(shapes)
 
 
+@pytest.mark.parametrize(
+    ("gone", "come", "rows"),
+    [
+        ("randomization", None, []),
+        ("randomization", 7, [["old_setting", "7", "-"], ["randomization.speed", "-", "0.0"]]),
+    ],
+)
+def test_a_setting_that_came_later_had_its_default_before(
+    gone: str, come: int | None, rows: list[list[str]], folder: Path, shapes: RunnerState
+) -> None:
+    """A run of a version that did not know it goes on; one with settings that are no more not."""
+    path = folder / "checkpoints" / "2" / "manifest.json"
+    told = json.loads(path.read_text())
+    del told["contents"]["config"][gone]
+    if come is not None:
+        told["contents"]["config"]["old_setting"] = come
+    told["sha256"] = manifest._contents_digest(told["contents"])
+    path.write_text(json.dumps(told))
+    with opened(folder) as checkpoints:
+        if not rows:
+            checkpoints.restore(shapes)
+            return
+        with pytest.raises(Mismatch) as found:
+            checkpoints.restore(shapes)
+    lines = [line.split() for line in found.value.table.splitlines()]
+    assert all(row in lines for row in rows)
+
+
 def test_another_map_is_noticed_but_not_where_it_lies(
     tmp_path: Path, states: list[RunnerState], shapes: RunnerState
 ) -> None:

@@ -45,7 +45,7 @@ def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.Monkey
     results += [entry("sqn", "maze", [0.0, 0.0], velocity_noise=0.1)]
     told = {"first": "sqn", "second": "r2d2", "probability": 1.0, "ci95": [0.5, 1.0]}
     back = {"first": "r2d2", "second": "sqn", "probability": 0.0, "ci95": [0.0, 0.5]}
-    write(tmp_path, "best_table.json", results, [told, back])
+    write(tmp_path, "seeds_table.json", results, [told, back])
     monkeypatch.setattr(readme_tables, "RESULTS", tmp_path)
     lines = readme_tables.seeds().splitlines()
     assert [cell.strip() for cell in lines[2].split("|")[1:-1]] == [
