@@ -15,12 +15,9 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import os
-import platform
 import sys
 from pathlib import Path
 from typing import Any
-
-import jax
 
 import sqn_jax
 from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
@@ -97,26 +94,15 @@ def memory() -> dict[str, Any]:
 
 def machine() -> dict[str, Any]:
     """What the numbers were taken on and with."""
-    device = jax.devices()[0]
     versions = {name: _version(name) for name in ("jax", "torch", "jaxmarl")}
     return {
         "command": " ".join(["experiments/benchmark.py", *sys.argv[1:]]),
-        "device": f"{device.platform} ({device.device_kind})",
-        "cpu": cpu_model(),
+        "device": devices.words(),
+        "cpu": devices.cpu_model(),
         "cpu_count": os.cpu_count(),
         "versions": {"sqn_jax": sqn_jax.__version__}
         | {name: version for name, version in versions.items() if version is not None},
     }
-
-
-def cpu_model() -> str:
-    """The processor by name, as well as the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str | None:

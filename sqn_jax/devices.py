@@ -12,6 +12,7 @@ an update.
 from __future__ import annotations
 
 import os
+import platform
 import sys
 from pathlib import Path
 from typing import Any
@@ -78,8 +79,19 @@ def _has_nvidia() -> bool:
 def words(mesh: Mesh | None = None) -> str:
     """What computes: the kind of device, and how many of them."""
     device = jax.devices()[0]
+    kind = cpu_model() if device.platform == "cpu" else device.device_kind
     times = "" if mesh is None else f" x {mesh.size}"
-    return f"{device.platform} ({device.device_kind}){times}"
+    return f"{device.platform} ({kind}){times}"
+
+
+def cpu_model() -> str:
+    """The processor by name, as well as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def num_cores() -> int:
