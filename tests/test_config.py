@@ -265,6 +265,7 @@ def changed_everywhere() -> TrainConfig:
             11,
             2,
             True,
+            0.25,
         ),
         exploration=config_module.ExplorationConfig(0.9, 0.3, 0.5, True),
         eval=config_module.EvalConfig(12, 34),

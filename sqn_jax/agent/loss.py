@@ -112,7 +112,12 @@ def _squared_error(
     config: LearnerConfig,
     discount: Array | float | None,
 ) -> tuple[Array, LossOutput]:
-    """Compare the taken actions' values with targets built from `bootstrap` [T' + 1, B]."""
+    """Compare the taken actions' values with targets built from `bootstrap` [T' + 1, B].
+
+    With advantage learning (Bellemare et al. 2016) each action's target is lowered by a share alpha
+    of what the action is worth less than the best one: the gap between them grows by 1 / (1 -
+    alpha), and the best action stays the best.
+    """
     actions, rewards, terminated = learned
     discount = config.discount if discount is None else discount
     discounts = discount * (1.0 - terminated.astype(jnp.float32))
@@ -122,6 +127,8 @@ def _squared_error(
     if config.value_rescaling:
         targets = rescale(targets)
     predictions = _pick(online.q_values[:-1], actions)
+    if config.advantage_learning > 0:
+        targets -= config.advantage_learning * (online.q_values[:-1].max(axis=-1) - predictions)
     td_errors = jax.lax.stop_gradient(targets) - predictions
     loss = 0.5 * (weights[None] * td_errors**2).mean()
     return loss, LossOutput(

@@ -201,6 +201,8 @@ class LearnerConfig:
     """pqn: how often each step is learned from."""
     restart_at_goal: bool = False
     """pqn: a robot that is at its goal at the end of a window gets a new task."""
+    advantage_learning: float = 0.0
+    """Alpha of advantage learning, which widens the gaps between actions; 0: plain Q-learning."""
 
     def __post_init__(self) -> None:
         require_known_words(self, "learner")
@@ -212,7 +214,8 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             require(value >= 0, f"learner.{name}", value, "0 or a positive number")
-        for name in ("discount", "discount_start", "trace_decay", "average_share"):
+        shares = ("trace_decay", "average_share", "advantage_learning")
+        for name in ("discount", "discount_start", *shares):
             value = getattr(self, name)
             require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         value = self.target_update_rate

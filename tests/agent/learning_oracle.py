@@ -182,6 +182,7 @@ def r2d2_loss(
     discount: float,
     double_q: bool,
     value_rescaling: bool,
+    advantage_learning: float = 0.0,
 ) -> tuple[float, FLOATS]:
     """The R2D2 loss and the TD errors [T', B].
 
@@ -201,8 +202,17 @@ def r2d2_loss(
     def multi_step(rewards: FLOATS, discounts: FLOATS, values: FLOATS, t: int) -> float:
         return n_step_return(rewards, discounts, values, t, n_step)
 
+    penalty = lowered(chooser, batch, burn_in_length, advantage_learning)
     return squared_errors(
-        online, bootstrap, multi_step, batch, burn_in_length, discount, value_rescaling, weights
+        online,
+        bootstrap,
+        multi_step,
+        batch,
+        burn_in_length,
+        discount,
+        value_rescaling,
+        weights,
+        penalty,
     )
 
 
@@ -215,6 +225,7 @@ def pqn_loss(
     trace_decay: float,
     discount: float,
     value_rescaling: bool,
+    advantage_learning: float = 0.0,
 ) -> tuple[float, FLOATS]:
     """The recurrent PQN loss and the TD errors [T, B]; targets come from `frozen_params`."""
     frozen_params = params if frozen_params is None else frozen_params
@@ -233,7 +244,19 @@ def pqn_loss(
         discount,
         value_rescaling,
         np.ones(batch.rewards.shape[1]),
+        lowered(frozen, batch, 0, advantage_learning),
     )
+
+
+def lowered(values: FLOATS, batch: Batch, burn_in_length: int, alpha: float) -> FLOATS:
+    """By how much advantage learning lowers the targets: alpha (V(s) - Q(s, a)), [T', B]."""
+    length, count = len(batch.rewards) - burn_in_length, batch.rewards.shape[1]
+    found = np.zeros((length, count))
+    for t in range(length):
+        for b in range(count):
+            action = batch.actions[burn_in_length + t, b]
+            found[t, b] = alpha * (max(values[t, b]) - values[t, b, action])
+    return found
 
 
 def after_burn_in(
@@ -257,6 +280,7 @@ def squared_errors(
     discount: float,
     value_rescaling: bool,
     weights: FLOATS,
+    penalty: FLOATS,
 ) -> tuple[float, FLOATS]:
     """Half the weighted mean of squared TD errors, sequence by sequence and step by step."""
     length = len(batch.rewards) - burn_in_length
@@ -274,7 +298,7 @@ def squared_errors(
             if value_rescaling:
                 target = rescale(target)
             prediction = online[t, b, batch.actions[burn_in_length + t, b]]
-            errors[t, b] = target - prediction
+            errors[t, b] = target - penalty[t, b] - prediction
             loss += 0.5 * weights[b] * errors[t, b] ** 2
     return loss / (length * num_sequences), errors
 

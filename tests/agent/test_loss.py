@@ -19,6 +19,7 @@ from sqn_jax.config import LearnerConfig
 LENGTH, BATCH = 9, 2
 WEIGHTS = np.array([1.0, 0.3])
 CONFIG = LearnerConfig(burn_in_length=3, n_step=2, discount=0.9, trace_decay=0.7)
+GAPS = dataclasses.replace(CONFIG, advantage_learning=0.5)
 
 r2d2_value = jax.jit(r2d2_loss, static_argnames=("network", "config"))
 pqn_value = jax.jit(pqn_loss, static_argnames=("network", "config"))
@@ -74,6 +75,7 @@ def r2d2_by_hand(
         discount=config.discount,
         double_q=config.double_q,
         value_rescaling=config.value_rescaling,
+        advantage_learning=config.advantage_learning,
     )
 
 
@@ -88,6 +90,7 @@ def pqn_by_hand(
         trace_decay=config.trace_decay,
         discount=config.discount,
         value_rescaling=config.value_rescaling,
+        advantage_learning=config.advantage_learning,
     )
 
 
@@ -96,6 +99,7 @@ SWITCHES: list[dict[str, Any]] = [
     {"double_q": False},
     {"value_rescaling": False},
     {"burn_in_length": 0},
+    {"advantage_learning": 0.7},
     {"n_step": 20, "discount": 1.0, "burn_in_length": 1},
 ]
 
@@ -123,7 +127,15 @@ def test_the_r2d2_loss_of_the_other_networks_equals_the_slow_one(algo: str) -> N
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"value_rescaling": False}, {"trace_decay": 0.0}, {"trace_decay": 1.0}], ids=str
+    "changes",
+    [
+        {},
+        {"value_rescaling": False},
+        {"trace_decay": 0.0},
+        {"trace_decay": 1.0},
+        {"advantage_learning": 0.7},
+    ],
+    ids=str,
 )
 def test_the_pqn_loss_equals_the_slow_one(changes: dict[str, Any]) -> None:
     given = problem("sqn", layer_norm=True)
@@ -159,19 +171,22 @@ def slope_along(loss: Any, params: Any, direction: Any) -> float:
     return (loss(ahead) - loss(behind)) / (2 * step)
 
 
+@pytest.mark.parametrize("config", [CONFIG, GAPS], ids=["plain", "advantage learning"])
 @pytest.mark.parametrize("method", ["r2d2", "pqn"])
-def test_only_predictions_after_burn_in_carry_a_gradient(method: str) -> None:
+def test_only_predictions_after_burn_in_carry_a_gradient(
+    method: str, config: LearnerConfig
+) -> None:
     """The slow loss is differentiated with its targets and its burn-in held fast."""
     given = problem("sqn", seed=21)
     frozen = in_float64(given.params)
     if method == "r2d2":
         weights = jnp.asarray(WEIGHTS, jnp.float32)
         call = (given.params, given.target_params, given.network, given.episodes, weights)
-        (gradient, target_gradient, _), _ = r2d2_slope(*call, CONFIG)
+        (gradient, target_gradient, _), _ = r2d2_slope(*call, config)
         assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(target_gradient))
         by_hand = r2d2_by_hand
     else:
-        gradient, _ = pqn_slope(given.params, given.network, given.episodes, CONFIG)
+        gradient, _ = pqn_slope(given.params, given.network, given.episodes, config)
         by_hand = pqn_by_hand
 
     rng = np.random.default_rng(22)
@@ -182,7 +197,7 @@ def test_only_predictions_after_burn_in_carry_a_gradient(method: str) -> None:
 
         direction = jax.tree_util.tree_map_with_path(draw, frozen)
         expected = slope_along(
-            lambda params: by_hand(given, CONFIG, "sqn", params, frozen)[0], frozen, direction
+            lambda params: by_hand(given, config, "sqn", params, frozen)[0], frozen, direction
         )
         products = jax.tree.map(lambda g, d: (g * d).sum(), in_float64(gradient), direction)
         np.testing.assert_allclose(
