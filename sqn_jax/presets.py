@@ -48,6 +48,7 @@ def _best() -> TrainConfig:
         quick,
         map="maze*8,maze:0-19,column:0-1,forest:0-3,cave:0-4",
         total_episodes=153_600,
+        learner=dataclasses.replace(quick.learner, advantage_learning=0.8),
         # Half of the run with hardly any chance: robots get stuck while there is time to learn.
         exploration=dataclasses.replace(quick.exploration, decay_fraction=0.5),
     )

@@ -124,8 +124,9 @@ def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
     """Refuse maps that would take minutes and gigabytes to prepare."""
     name, (height, width) = occupancy_map.name, occupancy_map.shape
     if height * width > MAX_CELLS:
+        instead = "fewer maps" if occupancy_map.parts else "coarser ones"
         raise ValueError(
-            f"map {name}: {width} x {height} cells, expected at most {MAX_CELLS:,}: coarser ones"
+            f"map {name}: {width} x {height} cells, expected at most {MAX_CELLS:,}: {instead}"
         )
     width_m, height_m = occupancy_map.tile_m
     points = (width_m + 1) * (height_m + 1) / config.coverage_cell**2
