@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
+from sqn_jax import config as configs
 from sqn_jax.agent.networks import Params, initial_carry
 from sqn_jax.checkpoint import Checkpoints
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import Observation
 from sqn_jax.manifest import Origin
 from sqn_jax.runlog import CHECKPOINTS, RunFolder
-from sqn_jax.train import averages, network_of
+from sqn_jax.train import RunnerState, averages, network_of
 
 
 @dataclass(frozen=True)
@@ -80,3 +82,37 @@ def seeds_of(params: Params, config: TrainConfig) -> tuple[Params, ...]:
     if config.num_seeds == 1:
         return (params,)
     return tuple(jax.tree.map(lambda x, i=i: x[i], params) for i in range(config.num_seeds))
+
+
+def require_same_network(policy: Policy, config: TrainConfig) -> None:
+    """Check that a run can start from a policy.
+
+    Raises:
+        ValueError: the policy is of another network, or sees other observations.
+    """
+    theirs, ours = (configs.flat(configs.to_dict(run)) for run in (policy.config, config))
+    for name in ours:
+        if name not in ("algo", "env.num_beams", "env.heading_encoding") and "network." not in name:
+            continue
+        if theirs[name] != ours[name]:
+            raise ValueError(
+                f"start_from {policy.name}: its {name} is {theirs[name]}, here it is {ours[name]}"
+            )
+
+
+def started_from(runner: RunnerState, policy: Policy) -> RunnerState:
+    """The state of a new run whose parameters are those of a policy, of its first seed."""
+
+    def filled(fresh: Params) -> Params:
+        return jax.tree.map(
+            lambda mine, theirs: jax.device_put(
+                jnp.array(jnp.broadcast_to(theirs, mine.shape)), mine.sharding
+            ),
+            fresh,
+            policy.params[0],
+        )
+
+    learner = runner.learner
+    target = None if learner.target_params is None else filled(learner.target_params)
+    learner = dataclasses.replace(learner, params=filled(learner.params), target_params=target)
+    return dataclasses.replace(runner, learner=learner)

@@ -26,6 +26,8 @@ from sqn_jax.env import EnvParams, make_env
 from sqn_jax.lock import locked
 from sqn_jax.manifest import Manifest, Origin
 from sqn_jax.maps import load_map, split_names
+from sqn_jax.policies import Policy, require_same_network, started_from
+from sqn_jax.pretrained import find_policy
 from sqn_jax.progress import episodes_bar
 from sqn_jax.runlog import CHECKPOINTS, SUMMARY, RunFolder, write_json, write_records
 from sqn_jax.signals import Interrupted, collected
@@ -80,6 +82,7 @@ def train_session(
     memory.require(held, "keeping its episodes", config.method)
     if tensorboard:
         require_tensorboard()
+    start = None if resume else _starting_policy(config)
     origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
     with ExitStack() as stack:
         stack.enter_context(locked(run_dir))
@@ -89,7 +92,9 @@ def train_session(
         _announce(config, env_params, run_dir, mesh, held)
         done = 0 if runner is None else _rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        training = _Training(env_params, config, mesh, folder, checkpoints)
+        if runner is None and resume:
+            start = _starting_policy(config)
+        training = _Training(env_params, config, mesh, folder, checkpoints, start)
         runner = training.drive(runner, None if board is None else board.scalars)
         if occupancy_map.tiles != (1, 1):
             first = split_names(config.map)[0]
@@ -102,6 +107,15 @@ def train_session(
     finish.conclude(results, training.timing, figures, config, folder)
 
 
+def _starting_policy(config: TrainConfig) -> Policy | None:
+    """The policy that a run is to start from, if any."""
+    if not config.start_from:
+        return None
+    policy = find_policy(config.start_from)
+    require_same_network(policy, config)
+    return policy
+
+
 def _announce(
     config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None, held: int
 ) -> None:
@@ -109,10 +123,11 @@ def _announce(
     if config.num_seeds > 1:
         seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
     episodes = config.num_rounds * config.num_envs
+    start = f"starting from {config.start_from}\n" if config.start_from else ""
     print(
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
         f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
-        f"run folder {run_dir}, device {devices.words(mesh)}, "
+        f"{start}run folder {run_dir}, device {devices.words(mesh)}, "
         f"episodes in memory {held / 1e6:,.1f} MB"
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
@@ -200,8 +215,10 @@ class _Training:
         mesh: Mesh | None,
         folder: RunFolder,
         checkpoints: Checkpoints,
+        start: Policy | None,
     ) -> None:
         self._env_params, self._config, self._mesh = env_params, config, mesh
+        self._start = start
         self._folder, self._checkpoints = folder, checkpoints
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
@@ -226,6 +243,8 @@ class _Training:
         program = self._compile()
         if runner is None:
             runner = start_run(self._env_params, config, self._mesh)
+            if self._start is not None:
+                runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
         saving = "stopping after this chunk and saving"
         with collected(saving) as received, episodes_bar(total, done * config.num_envs) as bar:

@@ -115,7 +115,7 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
 
     devices.use_cores()
     devices.require(own.device)
-    config = _with_absolute_map(config)
+    config = _with_absolute_paths(config)
     command = f"sqn train --run-dir {shlex.quote(str(run_dir))} --resume"
     with last_words(f"go on with `{command}`"):
         train_session(
@@ -128,10 +128,14 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
     return 0
 
 
-def _with_absolute_map(config: TrainConfig) -> TrainConfig:
-    """A map file stays findable when the run is resumed from another folder."""
+def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
+    """Files and folders stay findable when the run is resumed from another folder."""
     from sqn_jax.maps import weighted_names
+    from sqn_jax.pretrained import PREFIX
 
+    start = config.start_from
+    if start and not start.startswith(PREFIX):
+        config = dataclasses.replace(config, start_from=str(Path(start).resolve()))
     names = weighted_names(config.map)
     files = {name: Path(name).resolve() for name, _ in names if _is_map_file(Path(name))}
     if not files:
