@@ -31,8 +31,8 @@ from sqn_jax.maps import (
 NUM_NEIGHBORS = 4
 """Spawn points that count as near a spawn point."""
 
-MAX_CELLS = 2**23
-"""Cells of a map: the table of free space then takes about two minutes and half a gigabyte."""
+MAX_CELLS = 2**24
+"""Cells of a map: the table of free space then takes some minutes and a gigabyte."""
 
 MAX_LATTICE_POINTS = 2**22
 """Points on which the covered area is counted; every robot holds a bit of each."""

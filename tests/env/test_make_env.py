@@ -133,11 +133,13 @@ def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
     many = dataclasses.replace(
         room, spawn_points=np.tile(2 * points, (12_000, 1)), spawn_radius=1e6
     )
-    vast = dataclasses.replace(room, occupied=close_border(np.zeros((3000, 3000), dtype=bool)))
+    vast = dataclasses.replace(room, occupied=close_border(np.zeros((4200, 4200), dtype=bool)))
+    several = dataclasses.replace(vast, parts=((0.0, 0.0, 2.0, 2.0),))
     for large, fault in (
         (wide, r"4,000 x 4,000 m with env\.coverage_cell 0\.325 m are 151,"),
         (many, r"24000 spawn points with spawn_radius 1e\+06 m are 38,400,000 places"),
-        (vast, r"3000 x 3000 cells, expected at most 8,388,608"),
+        (vast, r"4200 x 4200 cells, expected at most 16,777,216: coarser ones"),
+        (several, r"4200 x 4200 cells, expected at most 16,777,216: fewer maps"),
     ):
         with pytest.raises(ValueError, match=fault):
             make_env(large)
