@@ -21,7 +21,14 @@ from sqn_jax.scores import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments" / "results"
-NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN", "bug": "bug", "oracle": "oracle"}
+NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
+PRETRAINED = {
+    "sqn best": "`pretrained:best`",
+    "sqn sqn": "`pretrained:sqn`",
+    "r2d2": "`pretrained:r2d2`",
+    "dqn": "`pretrained:dqn`",
+}
+"""Names of agents in evaluations of all policies that come with the package."""
 RADIUS = 0.3
 
 Entry = dict[str, Any]
@@ -31,8 +38,8 @@ def policies() -> str:
     """The policies that come with the package on the paper's four maps, beside the paper's."""
     entries = recorded("pretrained_table.json")["results"]
     rows = [
-        [NAMES[agent], *(_success_and_steps(_one(entries, agent, name)) for name in PAPER_MAPS)]
-        for agent in NAMES
+        [label, *(_success_and_steps(_one(entries, agent, name)) for name in PAPER_MAPS)]
+        for agent, label in (PRETRAINED | {"bug": "bug", "oracle": "oracle"}).items()
     ]
     for algorithm in ("sqn", "r2d2", "dqn"):
         found = [PAPER_RESULTS[algorithm][name] for name in PAPER_MAPS]
@@ -75,8 +82,8 @@ def noise() -> str:
     header = ["", "none", *(f"velocity {v:g}" for v in (0.1, 0.2, 0.3))]
     header += [f"range {r:.0%}".replace("%", " %") for r in (0.2, 0.4, 0.6)]
     rows = [
-        [NAMES[agent], *(_mean(_one(entries, agent, "maze", noise=level)) for level in levels)]
-        for agent in ("sqn", "r2d2", "dqn")
+        [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in levels)]
+        for agent, label in PRETRAINED.items()
     ]
     return markdown_table(header, rows)
 

@@ -36,7 +36,8 @@ def record(path: Path) -> dict[str, Any]:
         "run": path.name,
         "summary": json.loads((path / "summary.json").read_text(encoding="utf-8")),
         "evaluation": json.loads((path / "evaluation.json").read_text(encoding="utf-8"))["results"],
-        "config": to_dict(config),
+        # Where a run lay is nobody's business.
+        "config": to_dict(config) | {"start_from": Path(config.start_from).name},
         "curve": [{name: row[name] for name in CURVE} for row in kept],
     }
 

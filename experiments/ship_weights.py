@@ -1,7 +1,8 @@
 """Put the policies of finished runs into the package: python experiments/ship_weights.py RUN ...
 
-Each is named after its agent: `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`. The facts of
-its model card come from the run folder: how it was trained and what it reached right afterwards.
+Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
+says. The facts of its model card come from the run folder: how it was trained and what it reached
+right afterwards.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ def card(run_dir: Path, policy: Policy) -> dict[str, Any]:
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
-        "trained_on": Path(policy.config.map).stem,
+        "trained_on": policy.config.map,
+        "started_from": Path(policy.config.start_from).name,
         "training_episodes": summary["episodes"],
         "training_seed": policy.config.seed,
         "training_minutes": round(summary["wall_seconds"] / 60, 1),
@@ -56,11 +58,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder (default the package's)")
+    parser.add_argument("--name", help="of a single run's policy (default its agent's)")
     options = parser.parse_args()
+    if options.name and len(options.run_dirs) > 1:
+        parser.error("--name goes with a single run")
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir)
-        named = dataclasses.replace(policy, name=policy.config.algo)
+        named = dataclasses.replace(policy, name=options.name or policy.config.algo)
         write_policy(options.out, named, card(run_dir, policy))
         print(f"wrote {options.out / named.name}.npz and .json")
 

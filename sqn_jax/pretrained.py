@@ -91,6 +91,9 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
     """
     config = configs.to_dict(policy.config)
     config |= {"seed": policy.training_seeds[index], "num_seeds": 1}
+    config["start_from"] = Path(
+        policy.config.start_from
+    ).name  # Where it lay is of no use to others.
     flat = traverse_util.flatten_dict(policy.params[index], sep="/")
     file = io.BytesIO()
     arrays = {path: np.asarray(array) for path, array in flat.items()}

@@ -26,7 +26,8 @@ CONFIG = TrainConfig(seed=4, num_seeds=2, network=NetworkConfig(hidden_size=8))
 def policy() -> Policy:
     network = make_network("sqn", CONFIG.network, NUM_ACTIONS)
     params = [random_params(network, small_room(9), seed) for seed in (0, 1)]
-    return Policy("small", CONFIG, tuple(params))
+    config = dataclasses.replace(CONFIG, start_from="/somewhere/of/mine/first")
+    return Policy("small", config, tuple(params))
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def test_a_policy_comes_back_bit_for_bit(folder: Path, policy: Policy) -> None:
     found = pretrained.read_policy(folder, "small")
     assert found.name == "small"
     assert found.training_seeds == (5,)
-    assert found.config == dataclasses.replace(CONFIG, seed=5, num_seeds=1)
+    assert found.config == dataclasses.replace(CONFIG, seed=5, num_seeds=1, start_from="first")
     jax.tree.map(np.testing.assert_array_equal, found.params[0], policy.params[1])
     assert json.loads((folder / "small.json").read_text())["card"] == {"trained_on": "maze"}
 

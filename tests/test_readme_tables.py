@@ -58,16 +58,17 @@ def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_policies_stand_beside_the_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     maps = ("maze", "column", "forest", "cave")
-    results = [entry(a, m, [0.957]) for a in ("sqn", "r2d2", "dqn", "bug", "oracle") for m in maps]
+    agents = ("sqn best", "sqn sqn", "r2d2", "dqn", "bug", "oracle")
+    results = [entry(a, m, [0.957]) for a in agents for m in maps]
     results[3]["steps_over_oracle"] = None
     write(tmp_path, "pretrained_table.json", results, [])
     monkeypatch.setattr(readme_tables, "RESULTS", tmp_path)
     table = readme_tables.policies().splitlines()
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert cells[0] == ["", *maps]
-    assert cells[2] == ["SQN", *["0.96, 123 (1.23)"] * 3, "0.96, 123"]
-    assert cells[6][1] == "0.96, 123", "the oracle is not held against itself"
-    assert cells[7] == ["paper, SQN", "0.98, 181", "0.99, 149", "0.93, 171", "0.82, 768"]
+    assert cells[2] == ["`pretrained:best`", *["0.96, 123 (1.23)"] * 3, "0.96, 123"]
+    assert cells[7][1] == "0.96, 123", "the oracle is not held against itself"
+    assert cells[8] == ["paper, SQN", "0.98, 181", "0.99, 149", "0.93, 171", "0.82, 768"]
 
 
 def test_only_what_is_between_the_marks_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
