@@ -1,0 +1,96 @@
+"""How policies fail: python experiments/failures.py RUN|pretrained:NAME ... --map cave --out FILE
+
+For every ordered pair of evaluation points the share of successes, and what the robots that failed
+did in their last 200 steps: stand still (all of them within 1 m), pushing against something or
+not, or drive on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.common import run
+from sqn_jax.compare import Driven, Learnt, Settings, evaluate_agents, load_maps
+from sqn_jax.pretrained import find_policy
+from sqn_jax.progress import episodes_bar
+from sqn_jax.runlog import write_json
+
+LAST_STEPS = 200
+STILL = 1.0
+"""m; all last places of a robot that stands still lie in a square of this size."""
+PUSHING = 0.5
+"""A robot pushes if more than this share of its last moves was refused."""
+
+
+def failures(driven: Driven, points: NDArray[np.floating]) -> dict[str, Any]:
+    """What E episodes between evaluation points [P, 2] came to."""
+    summaries, trace = driven
+    success = np.asarray(summaries[0].success)
+    poses, goals = np.asarray(trace.poses), np.asarray(trace.goals)
+    last = poses[-LAST_STEPS:, ~success, :2]
+    still = np.ptp(last, axis=0).max(axis=-1) < STILL if last.size else np.zeros(0, bool)
+    refused = np.asarray(trace.collisions)[-LAST_STEPS:, ~success].mean(axis=0)
+    starts_at, goals_at = (_nearest(places, points) for places in (poses[0, :, :2], goals))
+    pairs = {}
+    for pair in sorted(set(zip(starts_at.tolist(), goals_at.tolist(), strict=True))):
+        same = (starts_at == pair[0]) & (goals_at == pair[1])
+        pairs[f"{pair[0] + 1} to {pair[1] + 1}"] = {
+            "episodes": int(same.sum()),
+            "success": float(success[same].mean()),
+        }
+    return {
+        "episodes": len(success),
+        "success": float(success.mean()),
+        "failures": int((~success).sum()),
+        "stand_still_pushing": int((still & (refused > PUSHING)).sum()),
+        "stand_still_otherwise": int((still & (refused <= PUSHING)).sum()),
+        "pairs": pairs,
+    }
+
+
+def _nearest(places: NDArray[np.floating], points: NDArray[np.floating]) -> NDArray[np.int64]:
+    away = np.hypot(*np.moveaxis(places[:, None] - points[None], -1, 0))
+    nearest: NDArray[np.int64] = away.argmin(axis=1)
+    return nearest
+
+
+def main() -> None:
+    """Drive every policy and write what became of its episodes."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("policies", nargs="+", metavar="RUN|pretrained:NAME")
+    parser.add_argument("--map", default="cave")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
+    found = {}
+    with episodes_bar(options.episodes * len(options.policies)) as bar:
+        for word in options.policies:
+            agent = Learnt(word, (find_policy(word),))
+            maps = load_maps([agent], settings)
+            (occupancy_map,) = maps.values()
+            kept: list[Driven] = []
+            evaluate_agents(
+                [agent],
+                maps,
+                settings,
+                bar.update,
+                lambda _agent, _world, _index, driven, kept=kept: kept.append(driven),  # type: ignore[misc]
+            )
+            found[Path(word).name] = failures(kept[0], occupancy_map.evaluation_points)
+    write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": found})
+    for name, told in found.items():
+        print(
+            f"{name}: success {told['success']:.2f}; of {told['failures']} failures "
+            f"{told['stand_still_pushing']} push and stand still, "
+            f"{told['stand_still_otherwise']} stand still otherwise"
+        )
+
+
+if __name__ == "__main__":
+    run(main)
