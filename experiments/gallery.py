@@ -26,10 +26,12 @@ OUT, RESULTS = ROOT / "docs" / "images", ROOT / "experiments" / "results"
 
 
 @cache
-def episodes(agent: str, map_name: str, count: int) -> tuple[Episode, ...]:
+def episodes(name: str, map_name: str, count: int) -> tuple[Episode, ...]:
     """The first episodes from the evaluation points, under the evaluation's first seed."""
-    driven = record(find_policy(f"pretrained:{agent}"), map_name, episodes=count)
-    return tuple(dataclasses.replace(episode, agent=agent.upper()) for episode in driven)
+    policy = find_policy(f"pretrained:{name}")
+    driven = record(policy, map_name, episodes=count)
+    agent = policy.config.algo.upper()
+    return tuple(dataclasses.replace(episode, agent=agent) for episode in driven)
 
 
 def maps() -> Any:
@@ -98,8 +100,8 @@ STILLS: dict[str, Callable[[], Any]] = {
         *(learning_curve, learning_curves, robustness),
     )
 }
-FILMS = {"maze": 8, "cave": 1}
-"""Maps that a film is made of, and how many episodes are driven there."""
+FILMS = {"maze": ("sqn", 8), "cave": ("best", 1)}
+"""Maps that a film is made of, who drives, and how many episodes; the first is shown."""
 
 
 def _recorded(name: str) -> Any:
@@ -116,9 +118,9 @@ def main() -> None:
         if not options.only or name in options.only:
             figures.save(draw(), options.out / f"{name}.png")
             print(f"wrote {options.out / name}.png", flush=True)
-    for name, count in FILMS.items():
+    for name, (policy, count) in FILMS.items():
         if not options.only or name in options.only:
-            film = figures.gif(episodes("sqn", name, count)[0], count=160, width_px=720)
+            film = figures.gif(episodes(policy, name, count)[0], count=160, width_px=720)
             (options.out / f"{name}.gif").write_bytes(film)
             print(f"wrote {options.out / name}.gif", flush=True)
 

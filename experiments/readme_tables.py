@@ -73,7 +73,8 @@ def seeds() -> str:
 
 def noise() -> str:
     """Success on the maze under the paper's noise."""
-    entries = recorded("pretrained_noise.json")["results"]
+    three = recorded("pretrained_noise.json")["results"]
+    best = recorded("best_noise.json")["results"]
     levels = [
         (0.0, 0.0),
         *((v, 0.0) for v in (0.1, 0.2, 0.3)),
@@ -83,7 +84,10 @@ def noise() -> str:
     header += [f"range {r:.0%}".replace("%", " %") for r in (0.2, 0.4, 0.6)]
     rows = [
         [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in levels)]
-        for agent, label in PRETRAINED.items()
+        for label, entries, agent in (
+            ("`pretrained:best`", best, "sqn"),
+            *((f"`pretrained:{agent}`", three, agent) for agent in NAMES),
+        )
     ]
     return markdown_table(header, rows)
 

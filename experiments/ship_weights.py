@@ -2,7 +2,7 @@
 
 Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
 says. The facts of its model card come from the run folder: how it was trained and what it reached
-right afterwards.
+right afterwards; for an earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from typing import Any
 from experiments.common import run
 from sqn_jax.policies import Policy, load_policy
 from sqn_jax.pretrained import write_policy
+from sqn_jax.runlog import RunFolder
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
 
 
-def card(run_dir: Path, policy: Policy) -> dict[str, Any]:
+def card(
+    run_dir: Path, policy: Policy, checkpoint: int | None, evaluation: Path | None
+) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
 
     Raises:
@@ -29,15 +32,18 @@ def card(run_dir: Path, policy: Policy) -> dict[str, Any]:
     if not (run_dir / "summary.json").is_file():
         raise ValueError(f"run folder {run_dir}: not finished, expected a summary.json in it")
     summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
-    found = json.loads((run_dir / "evaluation.json").read_text(encoding="utf-8"))["results"]
+    rows = RunFolder(run_dir).read_metrics()
+    last = next(row for row in rows if row["chunk"] == (checkpoint or rows[-1]["chunk"]))
+    file = evaluation or run_dir / "evaluation.json"
+    found = json.loads(file.read_text(encoding="utf-8"))["results"]
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
         "trained_on": policy.config.map,
         "started_from": Path(policy.config.start_from).name,
-        "training_episodes": summary["episodes"],
+        "training_episodes": last["episodes"],
         "training_seed": policy.config.seed,
-        "training_minutes": round(summary["wall_seconds"] / 60, 1),
+        "training_minutes": round(last["wall_seconds"] / 60, 1),
         "versions": summary["versions"],
         "evaluation": [
             {
@@ -49,6 +55,7 @@ def card(run_dir: Path, policy: Policy) -> dict[str, Any]:
                 "time_steps": entry["time_steps"],
             }
             for entry in found
+            if entry["goal_radius"] == policy.config.env.goal_radius
         ],
     }
 
@@ -59,14 +66,19 @@ def main() -> None:
     parser.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder (default the package's)")
     parser.add_argument("--name", help="of a single run's policy (default its agent's)")
+    parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
+    parser.add_argument("--evaluation", type=Path, help="of that checkpoint")
     options = parser.parse_args()
-    if options.name and len(options.run_dirs) > 1:
-        parser.error("--name goes with a single run")
+    if (options.checkpoint is None) != (options.evaluation is None):
+        parser.error("--checkpoint and --evaluation belong together")
+    if (options.name or options.checkpoint) and len(options.run_dirs) > 1:
+        parser.error("--name and --checkpoint go with a single run")
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:
-        policy = load_policy(run_dir)
+        policy = load_policy(run_dir, options.checkpoint or "newest")
         named = dataclasses.replace(policy, name=options.name or policy.config.algo)
-        write_policy(options.out, named, card(run_dir, policy))
+        facts = card(run_dir, policy, options.checkpoint, options.evaluation)
+        write_policy(options.out, named, facts)
         print(f"wrote {options.out / named.name}.npz and .json")
 
 

@@ -47,8 +47,8 @@ SEED = 1_000  # of starts and goals; the policy was trained with other ones
 # ## A map
 #
 # An occupancy grid: row 0 at the bottom, positions in metres from the lower left corner. Four come
-# with the package. The policies that do, too, have been trained on the maze, and never on the other
-# three themselves. The numbers are the evaluation points.
+# with the package; agents are trained on the maze, the others are for looking at what they make of
+# a map they never saw. The numbers are the evaluation points.
 
 # %%
 names = ("maze", "column") if SMALL else ("maze", "column", "forest", "cave")

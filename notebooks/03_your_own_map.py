@@ -12,8 +12,8 @@
 # # Your own map, from the file to the success rate
 #
 # SLAM writes a map as a grey image and a YAML file. This notebook makes such a pair, with all that
-# real ones have (unknown ground, a turned origin, specks), and drives a policy on it that has seen
-# mazes, pillars, trees and caves in training, but no office. You will learn
+# real ones have (unknown ground, a turned origin, specks), and drives a policy on it that was
+# trained on the maze alone. You will learn
 #
 # - which files a map is, and what is said of one that cannot be used,
 # - how to see what a map asks for before anything drives on it,
@@ -138,7 +138,7 @@ except ValueError as error:
 # %% [markdown]
 # ## Who finds the way
 #
-# The SQN of the package, the `bug` (a wall follower that sees what the SQN sees) and the `oracle`,
+# The SQN from the maze, the `bug` (a wall follower that sees what the SQN sees) and the `oracle`,
 # which knows the map: hardly anyone can be expected to need fewer steps. The same tasks for all,
 # between the evaluation points, with 95 % Wilson intervals; time steps count failures at the limit.
 
