@@ -17,7 +17,13 @@ from sqn_jax.runlog import RunFolder
 from sqn_jax.session import train_session
 from sqn_jax.signals import Interrupted, interruptible, last_words, say_stopped
 
+RESULTS = Path(__file__).resolve().parent / "results"
 ALGORITHMS: tuple[Algorithm, ...] = ("sqn", "r2d2", "dqn")
+
+
+def recorded(name: str) -> Any:
+    """A file of `experiments/results`."""
+    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common import run
-from sqn_jax.compare import Driven, Learnt, Settings, evaluate_agents, load_maps
+from sqn_jax.compare import (
+    Agent,
+    Driven,
+    Learnt,
+    Settings,
+    World,
+    evaluate_agents,
+    load_maps,
+    num_episodes,
+)
 from sqn_jax.pretrained import find_policy
 from sqn_jax.progress import episodes_bar
 from sqn_jax.runlog import write_json
@@ -68,21 +77,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
+    agents = [Learnt(word, (find_policy(word),)) for word in options.policies]
+    maps = load_maps(agents, settings)
     found = {}
-    with episodes_bar(options.episodes * len(options.policies)) as bar:
-        for word in options.policies:
-            agent = Learnt(word, (find_policy(word),))
-            maps = load_maps([agent], settings)
-            (occupancy_map,) = maps.values()
-            kept: list[Driven] = []
-            evaluate_agents(
-                [agent],
-                maps,
-                settings,
-                bar.update,
-                lambda _agent, _world, _index, driven, kept=kept: kept.append(driven),  # type: ignore[misc]
-            )
-            found[Path(word).name] = failures(kept[0], occupancy_map.evaluation_points)
+
+    def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
+        points = world.occupancy_map.evaluation_points
+        found[Path(agent.name).name] = failures(driven, points)
+
+    with episodes_bar(num_episodes(agents, settings)) as bar:
+        evaluate_agents(agents, maps, settings, bar.update, keep)
     write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": found})
     for name, told in found.items():
         print(

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ALGORITHMS, run
+from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
 from sqn_jax.maps import load_map
 from sqn_jax.presets import PAPER_MAPS
@@ -22,7 +21,7 @@ from sqn_jax.pretrained import find_policy
 from sqn_jax.recording import Episode, record
 
 ROOT = Path(__file__).resolve().parents[1]
-OUT, RESULTS = ROOT / "docs" / "images", ROOT / "experiments" / "results"
+OUT = ROOT / "docs" / "images"
 
 
 @cache
@@ -75,20 +74,20 @@ def agents() -> Any:
 
 def learning_curve() -> Any:
     """How the default preset learns, from the record of a run."""
-    rows = _recorded("maze_quick.json")["runs"][0]["curve"]
+    rows = recorded("maze_quick.json")["runs"][0]["curve"]
     return figures.learning_curve(rows, title="SQN on maze")
 
 
 def learning_curves() -> Any:
     """How three agents learn, from the record of the table's runs."""
-    found = _recorded("pretrained_runs.json")["runs"]
+    found = recorded("pretrained_runs.json")["runs"]
     curves = {one["config"]["algo"].upper(): [one["curve"]] for one in found}
     return figures.learning_curves(curves, title="Training on the maze")
 
 
 def robustness() -> Any:
     """Success under noise, from the record of the robustness runs."""
-    results = _recorded("pretrained_noise.json")["results"]
+    results = recorded("pretrained_noise.json")["results"]
     kept = [entry for entry in results if entry["goal_radius"] == results[0]["goal_radius"]]
     return figures.robustness(kept, title="Maze, evaluation points")
 
@@ -102,10 +101,6 @@ STILLS: dict[str, Callable[[], Any]] = {
 }
 FILMS = {"maze": ("sqn", 8), "cave": ("best", 1)}
 """Maps that a film is made of, who drives, and how many episodes; the first is shown."""
-
-
-def _recorded(name: str) -> Any:
-    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
 
 
 def main() -> None:

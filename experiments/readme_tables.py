@@ -7,20 +7,19 @@ With `--check` nothing is written: the exit code is 1 if a table is not what the
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common import run
+from experiments.common import recorded, run
+from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
 from sqn_jax.paper import PAPER_RESULTS
 from sqn_jax.presets import PAPER_MAPS
 from sqn_jax.scores import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "experiments" / "results"
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 PRETRAINED = {
     "sqn best": "`pretrained:best`",
@@ -41,7 +40,7 @@ def policies() -> str:
         [label, *(_success_and_steps(_one(entries, agent, name)) for name in PAPER_MAPS)]
         for agent, label in (PRETRAINED | {"bug": "bug", "oracle": "oracle"}).items()
     ]
-    for algorithm in ("sqn", "r2d2", "dqn"):
+    for algorithm in NAMES:
         found = [PAPER_RESULTS[algorithm][name] for name in PAPER_MAPS]
         cells = [f"{success:.2f}, {steps:.0f}" for success, steps in found]
         rows.append([f"paper, {NAMES[algorithm]}", *cells])
@@ -75,15 +74,10 @@ def noise() -> str:
     """Success on the maze under the paper's noise."""
     three = recorded("pretrained_noise.json")["results"]
     best = recorded("best_noise.json")["results"]
-    levels = [
-        (0.0, 0.0),
-        *((v, 0.0) for v in (0.1, 0.2, 0.3)),
-        *((0.0, r) for r in (0.2, 0.4, 0.6)),
-    ]
-    header = ["", "none", *(f"velocity {v:g}" for v in (0.1, 0.2, 0.3))]
-    header += [f"range {r:.0%}".replace("%", " %") for r in (0.2, 0.4, 0.6)]
+    header = ["", "none", *(f"velocity {level:g}" for level in VELOCITY_NOISE)]
+    header += [f"range {100 * level:.0f} %" for level in RANGE_NOISE]
     rows = [
-        [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in levels)]
+        [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in LEVELS)]
         for label, entries, agent in (
             ("`pretrained:best`", best, "sqn"),
             *((f"`pretrained:{agent}`", three, agent) for agent in NAMES),
@@ -111,11 +105,6 @@ def quick() -> str:
 
 
 TABLES = {each.__name__: each for each in (policies, seeds, noise, quick)}
-
-
-def recorded(name: str) -> Any:
-    """A file of `experiments/results`."""
-    return json.loads((RESULTS / name).read_text(encoding="utf-8"))
 
 
 def _one(

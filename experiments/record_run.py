@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sqn_jax.config import to_dict
+from sqn_jax.config import to_public_dict
 from sqn_jax.runlog import RunFolder
 
 CURVE = (
@@ -36,8 +36,7 @@ def record(path: Path) -> dict[str, Any]:
         "run": path.name,
         "summary": json.loads((path / "summary.json").read_text(encoding="utf-8")),
         "evaluation": json.loads((path / "evaluation.json").read_text(encoding="utf-8"))["results"],
-        # Where a run lay is nobody's business.
-        "config": to_dict(config) | {"start_from": Path(config.start_from).name},
+        "config": to_public_dict(config),
         "curve": [{name: row[name] for name in CURVE} for row in kept],
     }
 

@@ -24,6 +24,12 @@ from sqn_jax.session import evaluate_session
 
 VELOCITY_NOISE = (0.1, 0.2, 0.3)
 RANGE_NOISE = (0.2, 0.4, 0.6)
+LEVELS = (
+    (0.0, 0.0),
+    *((level, 0.0) for level in VELOCITY_NOISE),
+    *((0.0, level) for level in RANGE_NOISE),
+)
+"""Pairs of velocity noise and range noise."""
 
 
 def main() -> None:
@@ -38,11 +44,7 @@ def main() -> None:
         maps=(options.map,),
         episodes=episodes,
         eval_seeds=eval_seeds,
-        noise=(
-            (0.0, 0.0),
-            *((level, 0.0) for level in VELOCITY_NOISE),
-            *((0.0, level) for level in RANGE_NOISE),
-        ),
+        noise=LEVELS,
         noise_unit=options.noise_unit,
     )
     folders, out = prepare(options, settings)

@@ -39,8 +39,7 @@ def card(
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
-        "trained_on": policy.config.map,
-        "started_from": Path(policy.config.start_from).name,
+        "trained_on": Path(policy.config.map).stem,
         "training_episodes": last["episodes"],
         "training_seed": policy.config.seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),

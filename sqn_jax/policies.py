@@ -91,9 +91,9 @@ def require_same_network(policy: Policy, config: TrainConfig) -> None:
         ValueError: the policy is of another network, or sees other observations.
     """
     theirs, ours = (configs.flat(configs.to_dict(run)) for run in (policy.config, config))
-    for name in ours:
-        if name not in ("algo", "env.num_beams", "env.heading_encoding") and "network." not in name:
-            continue
+    decisive = ["algo", "env.num_beams", "env.heading_encoding"]
+    decisive += [name for name in ours if name.startswith("network.")]
+    for name in decisive:
         if theirs[name] != ours[name]:
             raise ValueError(
                 f"start_from {policy.name}: its {name} is {theirs[name]}, here it is {ours[name]}"

@@ -89,11 +89,8 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
         card: facts worth knowing, as JSON takes them: what it was trained on, what it reaches.
         index: which of its training seeds.
     """
-    config = configs.to_dict(policy.config)
+    config = configs.to_public_dict(policy.config)
     config |= {"seed": policy.training_seeds[index], "num_seeds": 1}
-    config["start_from"] = Path(
-        policy.config.start_from
-    ).name  # Where it lay is of no use to others.
     flat = traverse_util.flatten_dict(policy.params[index], sep="/")
     file = io.BytesIO()
     arrays = {path: np.asarray(array) for path, array in flat.items()}

@@ -74,6 +74,7 @@ def train_session(
     """
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
+    start = None if resume else _starting_policy(config)
     occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
@@ -82,7 +83,6 @@ def train_session(
     memory.require(held, "keeping its episodes", config.method)
     if tensorboard:
         require_tensorboard()
-    start = None if resume else _starting_policy(config)
     origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
     with ExitStack() as stack:
         stack.enter_context(locked(run_dir))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from experiments import readme_tables
+from experiments import common, readme_tables
 from experiments.readme_tables import TABLES, filled
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -46,7 +46,7 @@ def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.Monkey
     told = {"first": "sqn", "second": "r2d2", "probability": 1.0, "ci95": [0.5, 1.0]}
     back = {"first": "r2d2", "second": "sqn", "probability": 0.0, "ci95": [0.0, 0.5]}
     write(tmp_path, "seeds_table.json", results, [told, back])
-    monkeypatch.setattr(readme_tables, "RESULTS", tmp_path)
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
     lines = readme_tables.seeds().splitlines()
     assert [cell.strip() for cell in lines[2].split("|")[1:-1]] == [
         "SQN, 2 seeds",
@@ -62,7 +62,7 @@ def test_policies_stand_beside_the_paper(tmp_path: Path, monkeypatch: pytest.Mon
     results = [entry(a, m, [0.957]) for a in agents for m in maps]
     results[3]["steps_over_oracle"] = None
     write(tmp_path, "pretrained_table.json", results, [])
-    monkeypatch.setattr(readme_tables, "RESULTS", tmp_path)
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
     table = readme_tables.policies().splitlines()
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert cells[0] == ["", *maps]

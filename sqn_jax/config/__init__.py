@@ -8,7 +8,7 @@ The defaults follow the paper (section IV-D); where it is silent, docs/ARCHITECT
 value chosen and why. The other presets stand in `presets.py`.
 """
 
-from sqn_jax.config.files import flat, from_dict, load, save, to_dict
+from sqn_jax.config.files import flat, from_dict, load, save, to_dict, to_public_dict
 from sqn_jax.config.groups import (
     EnvConfig,
     EvalConfig,
@@ -36,4 +36,5 @@ __all__ = [
     "load",
     "save",
     "to_dict",
+    "to_public_dict",
 ]

@@ -19,6 +19,11 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def to_public_dict(config: TrainConfig) -> dict[str, Any]:
+    """`to_dict` for a file that others read: of a run it started from the name, not the place."""
+    return to_dict(config) | {"start_from": Path(config.start_from).name}
+
+
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted names, `learner.discount` for one of a group."""
     named: dict[str, Any] = {}
