@@ -245,7 +245,7 @@ def changed_everywhere() -> TrainConfig:
             velocity_noise_unit="absolute",
             range_noise_unit="absolute",
         ),
-        randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3),
+        randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3, True),
         network=config_module.NetworkConfig(9, 3, True, 2),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(

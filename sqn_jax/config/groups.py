@@ -107,6 +107,8 @@ class RandomizationConfig:
     """Half-width of each robot's range noise, from 0 to this; in place of `env.range_noise`."""
     speed: float = 0.0
     """Each robot's speeds and turn rate are up to this share faster or slower."""
+    mirror: bool = False
+    """Half of the robots live in the mirror image of the map."""
 
     def __post_init__(self) -> None:
         for name in ("velocity_noise", "range_noise"):

@@ -145,6 +145,9 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
         else:
             ranges = ranges + config.max_range * noise
     distance, heading = goal_in_robot_frame(state.pose, state.goal)
+    if params.mirrored is not None:
+        ranges = jnp.where(params.mirrored, ranges[::-1], ranges)
+        heading = jnp.where(params.mirrored, -heading, heading)
     scaled_distance = jnp.clip(distance / config.max_goal_distance, 0.0, 1.0)
     if config.heading_encoding == "linear":
         goal = jnp.stack([scaled_distance, (heading + jnp.pi) / (2 * jnp.pi)])

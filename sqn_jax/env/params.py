@@ -50,6 +50,10 @@ class EnvParams:
     effect unless `config.range_noise` is more than 0, which compiles the noise in."""
     reward_weights: Array
     """[3] weights of navigation, exploration and time."""
+    mirrored: Array | None
+    """bool: what the robot sees is the mirror image of where it is, left for right. With turn rates
+    of the other sign in `commands`, it lives in the mirror image of the map. None compiles nothing
+    in."""
     config: EnvConfig = struct.field(pytree_node=False)
     """The static settings this was made from."""
     max_steps: int = struct.field(pytree_node=False)

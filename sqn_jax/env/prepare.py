@@ -113,6 +113,7 @@ def make_env(
         reward_weights=jnp.array(
             [config.reward_navigation, config.reward_exploration, config.reward_time], jnp.float32
         ),
+        mirrored=None,
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),

@@ -15,7 +15,8 @@ from sqn_jax.env.params import EnvParams
 
 
 def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) -> EnvParams:
-    """The worlds of N robots: their noise and their speeds are spread evenly and independently.
+    """The worlds of N robots: their noise and their speeds are spread evenly and independently,
+    and half of them are mirrored.
 
     Robot n always has the same world, whatever the seed.
 
@@ -43,13 +44,20 @@ def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) ->
     if config.speed > 0:
         factors = jnp.asarray(1 + config.speed * (2 * shares[:, 2] - 1), jnp.float32)
         changes["commands"] = factors[:, None, None] * params.commands[None]
+    if config.mirror:
+        mirrored = _odd_ones(num_envs)
+        turns = jnp.asarray(np.stack([np.ones(num_envs), 1.0 - 2.0 * mirrored], axis=1))
+        commands = changes.get("commands", params.commands[None])
+        changes["commands"] = commands * turns[:, None].astype(jnp.float32)
+        changes["mirrored"] = jnp.asarray(mirrored)
     return dataclasses.replace(params, config=given, **changes)
 
 
 def robots_own(params: EnvParams) -> list[str]:
     """The fields in which each robot has something of its own."""
-    common = {"commands": 2, "velocity_noise": 1, "range_noise": 0}
-    return [name for name, rank in common.items() if jnp.ndim(getattr(params, name)) > rank]
+    common = {"commands": 2, "velocity_noise": 1, "range_noise": 0, "mirrored": 0}
+    fields = {name: getattr(params, name) for name in common}
+    return [name for name, x in fields.items() if x is not None and jnp.ndim(x) > common[name]]
 
 
 def robot_axes(params: EnvParams) -> Any:
@@ -68,3 +76,15 @@ def _spread(count: int) -> NDArray[np.float64]:
     sequence = np.arange(count)[:, None] * ratio ** -np.arange(1.0, 4.0) % 1.0
     ranks = sequence.argsort(axis=0).argsort(axis=0)
     return (ranks + 0.5) / count
+
+
+def _odd_ones(count: int) -> NDArray[np.bool_]:
+    """[N] which of the numbers 0..N - 1 have an odd number of ones in binary (Thue and Morse).
+
+    Half of them, and half of those that leave the same rest on division by a power of two: of every
+    minibatch, that is.
+    """
+    odd = np.zeros(count, bool)
+    for bit in range(count.bit_length()):
+        odd ^= (np.arange(count) >> bit & 1).astype(bool)
+    return odd
