@@ -91,6 +91,7 @@ PLOTTING_ROOMS = {"figures", "render"}
 JIT_MODULES = {
     *("sqn_jax.train", "sqn_jax.evaluate", "sqn_jax.recording"),
     *("experiments.bench_simulator", "experiments.bench_learner", "experiments.bench_breakdown"),
+    "experiments.check_gpu",
     "notebooks.01_first_steps",
 }
 JIT_NAMES = {"jit", "pjit", "pmap"}

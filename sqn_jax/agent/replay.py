@@ -124,7 +124,7 @@ def sample(
     chance = probabilities(state, priority_exponent)
     cumulative = jnp.cumsum(chance)
     draws = jax.random.uniform(key, (batch_size,)) * cumulative[-1]
-    places = jnp.searchsorted(cumulative, draws, side="right").astype(jnp.int32)
+    places = (cumulative[None] <= draws[:, None]).sum(axis=1, dtype=jnp.int32)
     places = jnp.minimum(places, state.size - 1)
     items = take(state.storage, *jnp.divmod(places, _block(state)), axis_name)
     weights = (state.size * chance[places]) ** -importance_exponent

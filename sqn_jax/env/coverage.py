@@ -28,6 +28,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.env.arithmetic import fraction, larger, smaller, to_integer
+from sqn_jax.env.loops import repeat
 
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 LATTICE_ANGLE = math.atan(GOLDEN_RATIO)
@@ -270,7 +271,7 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
     begin = jnp.broadcast_to(np.array([[FAR], [-FAR]], np.float32), rows.shape)
     nothing = [jnp.zeros(rows.shape, jnp.uint32)] * num_words
 
-    def draw_next(index: Array, carry: Any) -> Any:
+    def draw_next(index: Array | int, carry: Any) -> Any:
         begin, words, _ = carry
         part = jax.lax.dynamic_slice_in_dim(sectors, index * block, block, axis=1)
         # What comes out of a loop is not merged into what follows and computed there once more for
@@ -278,7 +279,7 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
         return *draw(begin, words, part), numbers
 
     start = (begin, nothing, jnp.zeros_like(numbers))
-    _, words, numbers = jax.lax.fori_loop(0, num_blocks, draw_next, start)
+    _, words, numbers = repeat(num_blocks, draw_next, start, unroll=1)
     return numbers, to_integer(first_points - 32 * own_words).astype(jnp.uint32), words
 
 

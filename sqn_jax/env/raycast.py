@@ -6,7 +6,6 @@ rays that need more hops than `iterations`: those are cut short, never too long.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -14,6 +13,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.env.arithmetic import fraction, larger, smaller, to_integer
+from sqn_jax.env.loops import repeat
 
 
 @struct.dataclass
@@ -110,7 +110,7 @@ def _hop(
     table_start = to_integer(sector) + (row * grid.width + column) * grid.sectors
     limit = max_range / grid.resolution
 
-    def hop(_: Array, travelled: Array) -> Array:
+    def hop(_: Array | int, travelled: Array) -> Array:
         # A thousandth of a cell beyond the last border, so that rounding cannot fall back.
         inside = travelled + 1e-3
         column, row = jnp.floor(x + cosines * inside), jnp.floor(y + sines * inside)
@@ -122,7 +122,7 @@ def _hop(
         return larger(travelled, smaller(smaller(to_side, to_top), limit))
 
     start = jnp.zeros_like(cosines)
-    return jax.lax.fori_loop(0, iterations, hop, start, unroll=unroll) * grid.resolution
+    return repeat(iterations, hop, start, unroll=unroll) * grid.resolution
 
 
 def is_blocked(grid: RayGrid, position: Array) -> Array:

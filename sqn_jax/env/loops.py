@@ -1,0 +1,26 @@
+"""Short loops, written out where starting a kernel is what takes time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+from jax import Array
+
+Carry = TypeVar("Carry")
+
+
+def repeat(
+    count: int, body: Callable[[Array | int, Carry], Carry], start: Carry, *, unroll: int
+) -> Carry:
+    """`jax.lax.fori_loop` from 0 to `count`, a few passes at a time; on a GPU, all of them.
+
+    On a CPU the compiler repeats what passes written out one after the other have in common, and on
+    a GPU each pass of a loop is a few kernels that take longer to start than to run.
+    """
+    looped = partial(jax.lax.fori_loop, 0, count, body, unroll=unroll)
+    written_out = partial(jax.lax.fori_loop, 0, count, body, unroll=True)
+    told: Carry = jax.lax.platform_dependent(start, cuda=written_out, default=looped)
+    return told
