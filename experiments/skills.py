@@ -1,0 +1,101 @@
+"""What each skill does: python experiments/skills.py RUN|pretrained:NAME --out FILE
+
+Success of an SQN as it is, of each of its skills alone and with the weights of its skills
+exchanged, in the same tasks; and the mean weights of its skills by what the robot is doing: at its
+goal, on new ground, on ground it has seen, or refused a move.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common import run
+from sqn_jax.compare import (
+    Agent,
+    Driven,
+    Learnt,
+    Settings,
+    World,
+    evaluate_agents,
+    load_maps,
+    num_episodes,
+)
+from sqn_jax.interventions import fix_skill_weights, swap_skills
+from sqn_jax.policies import Policy
+from sqn_jax.pretrained import find_policy
+from sqn_jax.progress import episodes_bar
+from sqn_jax.runlog import write_json
+
+AS_IT_IS = "as it is"
+NEW_GROUND = 0.1
+"""m2 a step: with less newly seen, a robot is on ground it knows."""
+NEAR = 1.0
+"""m from the goal: there a robot is at the goal, rather than on its way."""
+
+
+def variants(policy: Policy) -> dict[str, Policy]:
+    """The policy, each of its skills alone, and its skills exchanged, by name."""
+    count = policy.config.network.num_skills
+    alone = {
+        f"skill {index + 1} alone": fix_skill_weights(policy, np.eye(count)[index].tolist())
+        for index in range(count)
+    }
+    return {AS_IT_IS: policy, **alone, "exchanged": swap_skills(policy)}
+
+
+def weights_by_situation(driven: Driven) -> dict[str, Any]:
+    """Mean weights of the skills and the share of steps, before the goal and at it."""
+    trace = driven[1]
+    weights = np.asarray(trace.skill_weights)
+    refused, fresh = np.asarray(trace.collisions), np.asarray(trace.covered_areas) > NEW_GROUND
+    at_goal = np.asarray(trace.goal_distances) < NEAR
+    under_way = ~at_goal & ~refused
+    situations = {
+        "at the goal": at_goal,
+        "new ground": under_way & fresh,
+        "known ground": under_way & ~fresh,
+        "refused": refused & ~at_goal,
+    }
+    return {
+        name: {"share": float(steps.mean()), "weights": weights[steps].mean(axis=0).tolist()}
+        for name, steps in situations.items()
+        if steps.any()
+    }
+
+
+def main() -> None:
+    """Drive all variants and write what they came to."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("policy", metavar="RUN|pretrained:NAME")
+    parser.add_argument("--maps", nargs="+", default=["maze", "cave"])
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    agents = [Learnt(name, (it,)) for name, it in variants(find_policy(options.policy)).items()]
+    settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
+    maps = load_maps(agents, settings)
+    found: dict[str, Any] = {name: {} for name in options.maps}
+
+    def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
+        told: dict[str, Any] = {"success": float(np.mean(driven[0][0].success))}
+        if agent.name == AS_IT_IS:
+            told["weights"] = weights_by_situation(driven)
+        found[world.occupancy_map.name][agent.name] = told
+
+    with episodes_bar(num_episodes(agents, settings)) as bar:
+        evaluate_agents(agents, maps, settings, bar.update, keep)
+    write_json(options.out, {"policy": options.policy, "episodes": options.episodes, "maps": found})
+    for name, entries in found.items():
+        for variant, told in entries.items():
+            print(f"{name}, {variant}: success {told['success']:.2f}")
+        for situation, told in entries[AS_IT_IS]["weights"].items():
+            shown = ", ".join(f"{weight:.2f}" for weight in told["weights"])
+            print(f"  {situation} ({100 * told['share']:.0f} % of the steps): weights {shown}")
+
+
+if __name__ == "__main__":
+    run(main)
