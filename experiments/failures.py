@@ -15,19 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common import run
-from sqn_jax.compare import (
-    Agent,
-    Driven,
-    Learnt,
-    Settings,
-    World,
-    evaluate_agents,
-    load_maps,
-    num_episodes,
-)
+from sqn_jax.compare import Agent, Driven, Learnt, Settings, World
 from sqn_jax.pretrained import find_policy
-from sqn_jax.progress import episodes_bar
 from sqn_jax.runlog import write_json
+from sqn_jax.session import evaluate_session
 
 LAST_STEPS = 200
 STILL = 1.0
@@ -78,15 +69,13 @@ def main() -> None:
     options = parser.parse_args()
     settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
     agents = [Learnt(word, (find_policy(word),)) for word in options.policies]
-    maps = load_maps(agents, settings)
     found = {}
 
     def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
         points = world.occupancy_map.evaluation_points
         found[Path(agent.name).name] = failures(driven, points)
 
-    with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluate_agents(agents, maps, settings, bar.update, keep)
+    evaluate_session(agents, settings, on_driven=keep)
     write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": found})
     for name, told in found.items():
         print(

@@ -14,21 +14,12 @@ from typing import Any
 import numpy as np
 
 from experiments.common import run
-from sqn_jax.compare import (
-    Agent,
-    Driven,
-    Learnt,
-    Settings,
-    World,
-    evaluate_agents,
-    load_maps,
-    num_episodes,
-)
+from sqn_jax.compare import Agent, Driven, Learnt, Settings, World
 from sqn_jax.interventions import fix_skill_weights, swap_skills
 from sqn_jax.policies import Policy
 from sqn_jax.pretrained import find_policy
-from sqn_jax.progress import episodes_bar
 from sqn_jax.runlog import write_json
+from sqn_jax.session import evaluate_session
 
 AS_IT_IS = "as it is"
 NEW_GROUND = 0.1
@@ -77,17 +68,15 @@ def main() -> None:
     options = parser.parse_args()
     agents = [Learnt(name, (it,)) for name, it in variants(find_policy(options.policy)).items()]
     settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
-    maps = load_maps(agents, settings)
-    found: dict[str, Any] = {name: {} for name in options.maps}
+    found: dict[str, Any] = {}
 
     def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
         told: dict[str, Any] = {"success": float(np.mean(driven[0][0].success))}
         if agent.name == AS_IT_IS:
             told["weights"] = weights_by_situation(driven)
-        found[world.occupancy_map.name][agent.name] = told
+        found.setdefault(world.occupancy_map.name, {})[agent.name] = told
 
-    with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluate_agents(agents, maps, settings, bar.update, keep)
+    evaluate_session(agents, settings, on_driven=keep)
     write_json(options.out, {"policy": options.policy, "episodes": options.episodes, "maps": found})
     for name, entries in found.items():
         for variant, told in entries.items():

@@ -19,7 +19,14 @@ from jax.sharding import Mesh
 
 from sqn_jax import devices, divergence, finish, manifest, memory
 from sqn_jax.checkpoint import Checkpoints
-from sqn_jax.compare import Agent, Settings, evaluate_agents, load_maps, num_episodes
+from sqn_jax.compare import (
+    Agent,
+    OnDriven,
+    Settings,
+    evaluate_agents,
+    load_maps,
+    num_episodes,
+)
 from sqn_jax.compilation import kept_programs, watched_compilation
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
@@ -301,7 +308,10 @@ def _rounds_done(runner: RunnerState) -> int:
 
 @kept_programs()
 def evaluate_session(
-    agents: Sequence[Agent], settings: Settings, out: Path | None = None
+    agents: Sequence[Agent],
+    settings: Settings,
+    out: Path | None = None,
+    on_driven: OnDriven = lambda agent, world, index, driven: None,
 ) -> dict[str, Any]:
     """Evaluate agents under a progress bar.
 
@@ -309,6 +319,7 @@ def evaluate_session(
         agents: who drives; see `compare.evaluate_agents`.
         settings: where and how often.
         out: where to write the evaluation, a JSON file, and beside it one record an episode.
+        on_driven: see `compare.evaluate_agents`.
 
     Returns:
         The evaluation as written.
@@ -318,7 +329,7 @@ def evaluate_session(
     """
     maps = load_maps(agents, settings)
     with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluation, records = evaluate_agents(agents, maps, settings, bar.update)
+        evaluation, records = evaluate_agents(agents, maps, settings, bar.update, on_driven)
     if out is not None:
         write_json(out, evaluation)
         write_records(out.with_suffix(".jsonl"), records)

@@ -84,7 +84,4 @@ def _odd_ones(count: int) -> NDArray[np.bool_]:
     Half of them, and half of those that leave the same rest on division by a power of two: of every
     minibatch, that is.
     """
-    odd = np.zeros(count, bool)
-    for bit in range(count.bit_length()):
-        odd ^= (np.arange(count) >> bit & 1).astype(bool)
-    return odd
+    return np.bitwise_count(np.arange(count)) % 2 == 1
