@@ -77,7 +77,7 @@ def train_session(
         Mismatch: the checkpoints are of another run.
         NotSaved: a checkpoint could not be written.
         Diverged: the parameters are lost.
-        Interrupted: by SIGINT or SIGTERM; a chunk was finished and saved.
+        Interrupted: by a signal; a chunk was finished and saved.
     """
     devices.use_cores()
     mesh = devices.choose(config, num_devices)

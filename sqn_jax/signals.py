@@ -1,4 +1,4 @@
-"""What SIGINT and SIGTERM do to a command.
+"""What SIGINT, SIGTERM and SIGHUP, of a terminal that is gone, do to a command.
 
 Python handles a signal between two instructions of its main thread; a compilation or a chunk of
 training is one instruction, and takes seconds to minutes. A thread beside it is told at once: it
@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 GRACE = 5.0
 """Seconds the main thread is given to end in order, where nothing is left to be saved."""
@@ -28,7 +28,7 @@ _CLOSE, _AGAIN = 0, 255
 
 
 class Interrupted(KeyboardInterrupt):
-    """One of the two came in, anywhere; what is on its way up may clean up."""
+    """One of them came in, anywhere; what is on its way up may clean up."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -36,7 +36,7 @@ class Interrupted(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """130 or 143."""
+        """130, 143 or 129."""
         return 128 + self.signal
 
 
@@ -56,7 +56,8 @@ _said = _Said()
 def interruptible(command: str = "sqn") -> Iterator[None]:
     """Raise `Interrupted` upon a signal.
 
-    A second one ends the process at once, and so does the first after `GRACE` seconds.
+    A second one ends the process at once, and so does the first after `GRACE` seconds. What was
+    started to go on without its terminal, by nohup, goes on.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -73,11 +74,12 @@ def interruptible(command: str = "sqn") -> Iterator[None]:
             told(lost)
 
     told, sys.unraisablehook = sys.unraisablehook, raise_again
-    before = {each: signal.signal(each, stop) for each in STOPPING}
+    before = {each: signal.signal(each, stop) for each in _heeded()}
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    watch = threading.Thread(target=_watch, args=(reader, command), daemon=True)
+    on_terminal = [stream for stream in (1, 2) if os.isatty(stream)]
+    watch = threading.Thread(target=_watch, args=(reader, command, on_terminal), daemon=True)
     watch.start()
     try:
         yield
@@ -107,7 +109,7 @@ def collected(waiting: str) -> Iterator[list[int]]:
         yield received
         return
     before = {
-        each: signal.signal(each, lambda number, _: received.append(number)) for each in STOPPING
+        each: signal.signal(each, lambda number, _: received.append(number)) for each in _heeded()
     }
     _said.waiting = waiting
     try:
@@ -141,8 +143,17 @@ def say_stopped(number: int, command: str = "sqn") -> None:
     sys.stderr.flush()
 
 
-def _watch(reader: int, command: str) -> None:
-    """Read the numbers of signals as they come, until told to close."""
+def _heeded() -> list[signal.Signals]:
+    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [each for each in STOPPING if not (nohup and each == signal.SIGHUP)]
+
+
+def _watch(reader: int, command: str, on_terminal: list[int]) -> None:
+    """Read the numbers of signals as they come, until told to close.
+
+    Without their terminal the streams that lead there go nowhere: to write to it would fail, and
+    keep the main thread from saving what there is.
+    """
     first, deadline = 0, None
     while True:
         left = None if deadline is None else max(0.0, deadline - time.monotonic())
@@ -163,6 +174,11 @@ def _watch(reader: int, command: str) -> None:
             continue
         if number not in STOPPING:
             continue
+        if number == signal.SIGHUP:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in on_terminal:
+                os.dup2(nowhere, stream)
+            os.close(nowhere)
         if first:
             sys.stderr.write(f"\n{command}: stopped at once by {signal.Signals(number).name}\n")
             sys.stderr.flush()

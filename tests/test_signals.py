@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -72,7 +76,7 @@ class Child:
         return self.process.returncode, self.process.stdout.read(), self.process.stderr.read()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_in_python_ends_in_order(number: signal.Signals) -> None:
     with Child(IN_PYTHON) as child:
         child.send(number)
@@ -81,7 +85,7 @@ def test_a_signal_in_python_ends_in_order(number: signal.Signals) -> None:
         assert err == f"\nsqn: stopped by {number.name}\ngo on with this\n"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_compiled_code_is_not_waited_for_where_nothing_is_to_be_saved(
     number: signal.Signals,
 ) -> None:
@@ -103,7 +107,7 @@ IN_A_CALLBACK = """
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_that_gets_lost_in_a_callback_is_raised_again(number: signal.Signals) -> None:
     """Python prints what the garbage collector's callbacks raise, and goes on."""
     for _ in range(2):
@@ -157,6 +161,56 @@ def test_while_it_is_waited_for_a_second_signal_ends_at_once() -> None:
         code, out, err = child.end()
         assert (code, out) == (130, "")
         assert "stopped at once by SIGINT" in err
+
+
+WITHOUT_TERMINAL = """
+import os, sys, time
+from sqn_jax.signals import collected, interruptible
+with interruptible("sqn"), collected("saving") as received:
+    print("ready", flush=True)
+    while not received:
+        time.sleep(0.01)
+    time.sleep(0.2)
+    print("a line to a terminal that is gone", file=sys.stderr, flush=True)
+    with open(sys.argv[1], "w") as file:
+        file.write(f"saved after {received}")
+"""
+
+
+def start_on_terminal(saved: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """The program above as the first process of a terminal of its own, which is returned, too."""
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", WITHOUT_TERMINAL, str(saved)],
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(slave)
+    told = b""
+    while b"ready" not in told:
+        told += os.read(master, 100)
+    return process, master
+
+
+def test_a_terminal_that_is_closed_does_not_keep_from_saving(tmp_path: Path) -> None:
+    process, terminal = start_on_terminal(tmp_path / "saved")
+    os.close(terminal)
+    assert process.wait(timeout=60) == 0
+    assert (tmp_path / "saved").read_text() == f"saved after [{signal.SIGHUP:d}]"
+
+
+def test_what_was_started_to_go_on_without_a_terminal_goes_on() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interruptible(), collected("saving") as received:
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert received == []
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_afterwards_signals_are_what_they_were() -> None:

@@ -3,7 +3,7 @@
 It wires words to functions, no more.
 
 Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback),
-130 and 143 stopped by SIGINT or SIGTERM after saving.
+130, 143 and 129 stopped by SIGINT, SIGTERM or SIGHUP after saving.
 """
 
 from __future__ import annotations
