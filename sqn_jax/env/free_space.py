@@ -14,6 +14,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+CELLS_AT_ONCE = 2**14
+"""Cells whose rectangles are looked for together: few enough for the processor's caches."""
+
 
 def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDArray[np.uint16]:
     """Build the table.
@@ -65,15 +68,13 @@ def far_sides(rectangles: NDArray[np.uint16]) -> NDArray[np.int16]:
     """
     sectors = len(rectangles)
     middle = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
-    sides = []
-    for length, component in (
-        (rectangles & 255, np.cos(middle)),
-        (rectangles >> 8, np.sin(middle)),
-    ):
-        forward = (component > 0)[:, None, None]
-        length = length.astype(np.int16)
-        sides.append(np.where(forward, length, 1 - length))
-    return (sides[0] & 255) | (sides[1] << 8)
+    sides = np.empty(rectangles.shape, np.int16)
+    for sector, angle in enumerate(middle):
+        width, height = (rectangles[sector] & 255, rectangles[sector] >> 8)
+        columns = width if np.cos(angle) > 0 else 1 - width
+        rows = height if np.sin(angle) > 0 else 1 - height
+        sides[sector] = ((columns & 255) | (rows << 8)).view(np.int16)
+    return sides
 
 
 class _Sums:
@@ -94,6 +95,8 @@ class _Sums:
         self.stride = sums.shape[1]
         self.sums = sums.reshape(-1)
         self.corners = rows * self.stride + columns
+        self.run_x = np.minimum(_run(blocked)[self.free], reach)
+        self.run_y = np.minimum(_run(blocked.T).T[self.free], reach)
 
     def largest_free(self, cosine: float, sine: float) -> NDArray[np.uint16]:
         """The free rectangle from each cell towards +x, +y that takes a ray of the slope farthest.
@@ -106,37 +109,52 @@ class _Sums:
         one = (lengths > 0).astype(np.int32)
         along_x = np.maximum(np.ceil(lengths * cosine).astype(np.int32) + slack, one)
         along_y = np.maximum(np.ceil(lengths * sine).astype(np.int32) + slack, one)
-        strip = (lengths, one) if cosine > sine else (one, lengths)
         width, height = self._longest(along_x, along_y)
-        strip_width, strip_height = self._longest(*strip)
+        ahead = cosine > sine
+        strip_width, strip_height = (self.run_x, 1) if ahead else (1, self.run_y)
         better = _advance(strip_width, strip_height, cosine, sine) > _advance(
             width, height, cosine, sine
         )
-        width = np.where(better, strip_width, width)
-        height = np.where(better, strip_height, height)
         table = np.zeros(self.free.shape, np.uint16)
-        table[self.free] = width + 256 * height
+        table[self.free] = np.where(better, strip_width + 256 * strip_height, width + 256 * height)
         return table
 
     def _longest(
-        self, widths: NDArray[np.integer], heights: NDArray[np.integer]
-    ) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+        self, widths: NDArray[np.int32], heights: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Width and height [F] of the last free one of nested candidates, by binary search."""
-        free = np.zeros(self.corners.shape, np.int32)
-        blocked = np.full(self.corners.shape, self.reach + 1, np.int32)
-        before = self.sums[self.corners]
         ups, rights = heights.astype(np.intp) * self.stride, widths.astype(np.intp)
-        while (blocked - free > 1).any():
-            middle = np.minimum((free + blocked) // 2, self.reach)
-            up, right = self.corners + ups[middle], rights[middle]
-            total = self.sums[up + right] - self.sums[self.corners + right] - self.sums[up] + before
-            free = np.where(total == 0, np.maximum(free, middle), free)
-            blocked = np.where(total == 0, blocked, np.minimum(blocked, middle))
-        return widths[free], heights[free]
+        corners = ups + rights
+        longest = np.empty(self.corners.shape, np.intp)
+        for first in range(0, len(longest), CELLS_AT_ONCE):
+            cells = slice(first, first + CELLS_AT_ONCE)
+            corner = self.corners[cells]
+            before = self.sums.take(corner)
+            free, blocked = np.zeros_like(corner), np.full_like(corner, self.reach + 1)
+            for _ in range(self.reach.bit_length()):
+                middle = (free + blocked) // 2
+                total = self.sums.take(corner + corners.take(middle)) + before
+                total -= self.sums.take(corner + rights.take(middle))
+                total -= self.sums.take(corner + ups.take(middle))
+                free = np.where(total == 0, middle, free)
+                blocked = np.where(total == 0, blocked, middle)
+            longest[cells] = free
+        return widths[longest], heights[longest]
+
+
+def _run(blocked: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Cells [H, W] from each cell on, itself among them, to the next blocked one along its row."""
+    width = blocked.shape[1]
+    columns = np.arange(width, dtype=np.int32)
+    ends = np.where(blocked, columns, np.int32(width))[:, ::-1]
+    return np.minimum.accumulate(ends, axis=1)[:, ::-1] - columns
 
 
 def _advance(
-    width: NDArray[np.integer], height: NDArray[np.integer], cosine: float, sine: float
+    width: NDArray[np.integer] | int,
+    height: NDArray[np.integer] | int,
+    cosine: float,
+    sine: float,
 ) -> NDArray[np.floating]:
     """Cells a ray of the given direction goes from the corner to the far side of a rectangle."""
     return np.minimum(width / cosine, height / sine)

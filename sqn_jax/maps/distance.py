@@ -6,6 +6,7 @@ Arrays are `[row, col]` with row 0 at the bottom; the centre of a cell is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -50,6 +51,39 @@ def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
     d_row = nearest[0, 1::2, 1::2] - np.arange(1, 2 * rows, 2)[:, None]
     d_col = nearest[1, 1::2, 1::2] - np.arange(1, 2 * cols, 2)[None, :]
     return 0.5 * np.hypot(d_row, d_col)
+
+
+def is_clear(occupied: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """Cells that are free and whose centre is at least so far from every occupied square.
+
+    What `clearance_cells(occupied) >= radius` says, without the distances themselves: much faster
+    for the few cells of a robot's radius. A square of an occupied cell (i, j) cells away is
+    hypot(max(i - 1/2, 0), max(j - 1/2, 0)) from the centre.
+
+    Args:
+      occupied: bool [H, W].
+      radius: cells; what is negative counts as 0.
+
+    Returns:
+      bool [H, W].
+    """
+    rows = len(occupied)
+    clear = ~occupied
+    for i in range(min(math.ceil(radius + 0.5), rows)):
+        reach = 0  # Cells sideways, in a row i away, whose squares are too near.
+        while math.hypot(max(i - 0.5, 0.0), max(reach - 0.5, 0.0)) < radius:
+            reach += 1
+        if reach == 0:
+            continue
+        near = _widened(occupied, reach - 1)
+        clear[: rows - i] &= ~near[i:]
+        clear[i:] &= ~near[: rows - i]
+    return clear
+
+
+def _widened(occupied: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Cells with an occupied one at most so many columns away in their row."""
+    return ndimage.maximum_filter1d(occupied, 2 * reach + 1, axis=1, mode="constant")
 
 
 def obstacle_distance(occupied: NDArray[np.bool_], resolution: float) -> NDArray[np.float32]:

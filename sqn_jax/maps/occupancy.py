@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sqn_jax.maps.distance import clearance_cells
+from sqn_jax.maps.distance import clearance_cells, is_clear
 
 SPAWN_COUNT = 16
 EVALUATION_COUNT = 4
@@ -142,15 +142,8 @@ def traversable(
     Returns:
       bool [H, W].
     """
-    return _fits(clearance_cells(occupied), resolution, robot_radius)
-
-
-def _fits(
-    clearance: NDArray[np.float64], resolution: float, robot_radius: float
-) -> NDArray[np.bool_]:
-    """`traversable` from the distance to the nearest occupied square in cells (0 inside one)."""
     # A millionth of a cell of slack: 0.15 / 0.05 is not exactly 3.
-    return (clearance > 0) & (clearance >= robot_radius / resolution - 1e-6)
+    return is_clear(occupied, robot_radius / resolution - 1e-6)
 
 
 def connected_components(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
@@ -184,7 +177,7 @@ def sample_spawn_points(
       ValueError: no free space for the robot.
     """
     clearance = clearance_cells(occupied)
-    component = largest_component(_fits(clearance, resolution, robot_radius))
+    component = largest_component(traversable(occupied, resolution, robot_radius))
     if not component.any():
         raise ValueError(f"no free space for a robot of radius {robot_radius:g} m")
     clearance = np.where(component, clearance, 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sqn_jax.maps.distance import clearance_cells
+from sqn_jax.maps.distance import is_clear
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -214,7 +214,7 @@ def fill_pockets(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def roomy_cells(occupied: NDArray[np.bool_], room: float) -> NDArray[np.int64]:
     """Cells (row, col) [C, 2] with at least `room` m to the nearest obstacle, row by row."""
-    return np.argwhere(clearance_cells(occupied) >= room / RESOLUTION)
+    return np.argwhere(is_clear(occupied, room / RESOLUTION))
 
 
 def spread(cells: NDArray[np.int64], count: int) -> NDArray[np.int64]:

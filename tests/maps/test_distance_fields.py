@@ -10,7 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sqn_jax.maps.distance import clear_moves, goal_distance, obstacle_distance, segment_cells
+from sqn_jax.maps.distance import (
+    clear_moves,
+    goal_distance,
+    is_clear,
+    obstacle_distance,
+    segment_cells,
+)
 
 
 def random_grid(seed: int, share: float) -> np.ndarray:
@@ -45,6 +51,26 @@ def test_the_nearest_centre_is_not_always_the_nearest_square() -> None:
     occupied = np.zeros((9, 8), dtype=bool)
     occupied[5, 5] = occupied[0, 7] = True
     assert obstacle_distance(occupied, 1.0)[0, 0] == pytest.approx(4.5 * math.sqrt(2))
+
+
+@settings(max_examples=80)
+@given(seed=st.integers(0, 10**6), share=st.floats(0, 0.4), radius=st.floats(-1, 40))
+def test_cells_are_clear_that_are_free_and_far_enough(
+    seed: int, share: float, radius: float
+) -> None:
+    occupied = random_grid(seed, share)
+    expected = ~occupied & (brute_obstacle_distance(occupied, 1.0) >= radius)
+    np.testing.assert_array_equal(is_clear(occupied, radius), expected)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 1.5, math.hypot(1.5, 0.5), 2.5, math.hypot(2.5, 2.5)])
+def test_a_cell_exactly_as_far_away_is_clear(radius: float) -> None:
+    """Exact ties, which a search among random radii hardly ever meets."""
+    occupied = np.zeros((9, 11), dtype=bool)
+    occupied[4, 5] = True
+    away = brute_obstacle_distance(occupied, 1.0)
+    assert (away == radius).any()
+    np.testing.assert_array_equal(is_clear(occupied, radius), ~occupied & (away >= radius))
 
 
 def touches(x0: float, y0: float, x1: float, y1: float, row: int, col: int) -> bool:
