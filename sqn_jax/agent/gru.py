@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from sqn_jax.agent import gru_kernel
-from sqn_jax.agent.linear import affine, sum_rows
+from sqn_jax.agent.linear import Branches, Linear, sum_rows, then
 
 
 class GRU(nn.Module):
@@ -30,11 +30,11 @@ class GRU(nn.Module):
     hidden_size: int
 
     @nn.compact
-    def __call__(self, inputs: Array, carry: Array) -> tuple[Array, Array]:
+    def __call__(self, inputs: Branches, carry: Array) -> tuple[Array, Array]:
         """Run over a sequence.
 
         Args:
-            inputs: [T, B, D].
+            inputs: [T, B, D], as outputs of linear layers.
             carry: [B, H] hidden state before the first step.
 
         Returns:
@@ -42,14 +42,14 @@ class GRU(nn.Module):
         """
         size = self.hidden_size
         input_kernel = self.param(
-            "input_kernel", nn.initializers.lecun_normal(), (inputs.shape[-1], 3 * size)
+            "input_kernel", nn.initializers.lecun_normal(), (inputs.size, 3 * size)
         )
         input_bias = self.param("input_bias", nn.initializers.zeros, (3 * size,))
         hidden_kernel = self.param("hidden_kernel", _orthogonal_gates, (size, 3 * size))
         candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (size,))
         gates = zip(split_gates(input_kernel), split_gates(input_bias), strict=True)
-        projected = tuple(affine(inputs, kernel, bias) for kernel, bias in gates)
-        hidden = scan_gates(projected, carry, hidden_kernel, candidate_bias)
+        reset, update, candidate = then(inputs, [Linear(*gate) for gate in gates])
+        hidden = scan_gates((reset, update, candidate), carry, hidden_kernel, candidate_bias)
         return hidden[-1], hidden
 
 

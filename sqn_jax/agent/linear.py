@@ -1,6 +1,10 @@
-"""A linear layer over all leading axes at once, with a derivative arranged for speed."""
+"""Linear layers over all leading axes at once, arranged for speed."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,3 +44,62 @@ def sum_rows(rows: Array) -> Array:
 
 
 affine.defvjp(_forward, _backward)
+
+
+class Linear(NamedTuple):
+    """A linear layer's `kernel` [D, E] and `bias` [E]."""
+
+    kernel: Array
+    bias: Array
+
+
+class Branches(NamedTuple):
+    """Linear layers side by side, not applied yet: what follows may make it unnecessary."""
+
+    inputs: tuple[Array, ...]
+    """[..., D_i] what each layer is given."""
+    layers: tuple[Linear, ...]
+    """Kernels [D_i, E_i]."""
+
+    @property
+    def size(self) -> int:
+        """Number E of outputs, the sum of all E_i."""
+        return sum(layer.bias.size for layer in self.layers)
+
+    def outputs(self) -> Array:
+        """What the layers make of their inputs, side by side: [..., E]."""
+        pairs = zip(self.inputs, self.layers, strict=True)
+        outputs = [affine(inputs, *layer) for inputs, layer in pairs]
+        return outputs[0] if len(outputs) == 1 else jnp.concatenate(outputs, axis=-1)
+
+
+def then(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
+    """The outputs of `branches` through each of further linear layers, [..., F_j] each.
+
+    Two linear layers in a row, (x A + a) B + b, are one, x (A B) + (a B + b). Of many rows x that
+    takes fewer multiplications, and A's output need not be written and read; of few it takes more.
+    The order is chosen by their number.
+
+    Args:
+        branches: with E outputs in all.
+        following: kernels [E, F_j].
+    """
+    rows = math.prod(branches.inputs[0].shape[:-1])
+    ahead = sum(layer.bias.size for layer in following)
+    given = sum(layer.kernel.shape[0] for layer in branches.layers)
+    apart = rows * sum(layer.kernel.size for layer in (*branches.layers, *following))
+    at_once = ahead * (rows * given + sum(layer.kernel.size for layer in branches.layers))
+    if apart <= at_once:
+        outputs = branches.outputs()
+        return tuple(affine(outputs, *layer) for layer in following)
+    inputs = jnp.concatenate(branches.inputs, axis=-1)
+    return tuple(affine(inputs, *_composed(branches.layers, layer)) for layer in following)
+
+
+def _composed(first: Sequence[Linear], second: Linear) -> Linear:
+    """One layer [D, F] for those of `first`, side by side, and `second` [E, F] after them."""
+    ends = [sum(layer.bias.size for layer in first[: count + 1]) for count in range(len(first))]
+    pieces = jnp.split(second.kernel, ends[:-1])
+    pairs = list(zip(first, pieces, strict=True))
+    kernel = jnp.concatenate([layer.kernel @ piece for layer, piece in pairs])
+    return Linear(kernel, second.bias + sum(layer.bias @ piece for layer, piece in pairs))

@@ -16,7 +16,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.gru import GRU
-from sqn_jax.agent.linear import affine
+from sqn_jax.agent.linear import Branches, Linear, affine, then
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -64,12 +64,14 @@ class MLP(nn.Module):
     """Scale of the first layer's initial weights and biases."""
 
     @nn.compact
-    def __call__(self, inputs: Array) -> Array:
-        """Map [..., D] to [..., output_size]."""
-        hidden = _dense(self.hidden_size, "hidden", self.input_scale)(inputs)
+    def __call__(self, inputs: Array) -> Branches:
+        """Map [..., D] to [..., output_size], all but the output layer done."""
+        layer = _linear(inputs.shape[-1], self.hidden_size, "hidden", self.input_scale)
+        hidden = affine(inputs, *layer)
         if self.layer_norm:
             hidden = _layer_norm("norm")(hidden)
-        return _dense(self.output_size, "output", self.output_scale)(nn.relu(hidden))
+        output = _linear(self.hidden_size, self.output_size, "output", self.output_scale)
+        return Branches((nn.relu(hidden),), (output,))
 
 
 class Features(nn.Module):
@@ -78,13 +80,13 @@ class Features(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, obs: HasObservation) -> Array:
+    def __call__(self, obs: HasObservation) -> Branches:
         """Map an observation [T, B, ...] to features [T, B, 2 H]."""
         size = self.config.hidden_size
         # Never normalised: over two inputs it would keep their ratio and lose their size.
         ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges)
         goal = MLP(size, size, layer_norm=False, input_scale=GOAL_SCALE, name="goal")(obs.goal)
-        return jnp.concatenate([ranges, goal], axis=-1)
+        return Branches(ranges.inputs + goal.inputs, ranges.layers + goal.layers)
 
 
 class SkillQNetwork(nn.Module):
@@ -103,12 +105,12 @@ class SkillQNetwork(nn.Module):
         decision = MLP(size, config.num_skills, norm, HEAD_SCALE, name="decision")(
             perception + self._embedding("decision_embedding")
         )
-        skill_weights = nn.softmax(decision, axis=-1)
+        skill_weights = nn.softmax(decision.outputs(), axis=-1)
         skill_q_values = jnp.stack(
             [
                 MLP(size, self.num_actions, norm, HEAD_SCALE, name=f"skill_{index}")(
                     perception + self._embedding(f"skill_{index}_embedding")
-                )
+                ).outputs()
                 for index in range(config.num_skills)
             ],
             axis=-2,
@@ -134,8 +136,8 @@ class RecurrentQNetwork(nn.Module):
         size, norm = self.config.hidden_size, self.config.layer_norm
         features = Features(self.config, name="features")(obs)
         carry, perception = GRU(size, name="perception")(features, carry)
-        q_values = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(perception)
-        return carry, _single_head(q_values)
+        head = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(perception)
+        return carry, _single_head(head.outputs())
 
 
 class FeedForwardQNetwork(nn.Module):
@@ -149,12 +151,11 @@ class FeedForwardQNetwork(nn.Module):
         """Return the carry unchanged and the Q-values for observations [T, B, ...]."""
         width = self.config.hidden_size * self.config.dqn_width_factor
         features = Features(self.config, name="features")(obs)
-        hidden = _dense(width, "perception")(features)
+        (hidden,) = then(features, [_linear(features.size, width, "perception")])
         if self.config.layer_norm:
             hidden = _layer_norm("norm")(hidden)
         head = MLP(width, self.num_actions, self.config.layer_norm, HEAD_SCALE, name="skill_0")
-        q_values = head(nn.relu(hidden))
-        return carry, _single_head(q_values)
+        return carry, _single_head(head(nn.relu(hidden)).outputs())
 
 
 QNetwork = SkillQNetwork | RecurrentQNetwork | FeedForwardQNetwork
@@ -184,18 +185,17 @@ def _single_head(q_values: Array) -> QOutput:
     )
 
 
-class _Dense(nn.Module):
-    """A linear layer."""
+class _Linear(nn.Module):
+    """The parameters of a linear layer."""
 
     size: int
     scale: float
 
     @nn.compact
-    def __call__(self, inputs: Array) -> Array:
+    def __call__(self, fan_in: int) -> Linear:
         initializer = nn.initializers.variance_scaling(self.scale**2, "fan_in", "truncated_normal")
-        kernel = self.param("kernel", initializer, (inputs.shape[-1], self.size))
-        bias = self.param("bias", _uniform_bias(inputs.shape[-1], self.scale), (self.size,))
-        return affine(inputs, kernel, bias)
+        kernel = self.param("kernel", initializer, (fan_in, self.size))
+        return Linear(kernel, self.param("bias", _uniform_bias(fan_in, self.scale), (self.size,)))
 
 
 def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:
@@ -208,8 +208,10 @@ def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:
     return initialize
 
 
-def _dense(size: int, name: str, scale: float = 1.0) -> _Dense:
-    return _Dense(size, scale, name=name)
+def _linear(fan_in: int, size: int, name: str, scale: float = 1.0) -> Linear:
+    """A layer of the module that is being set up, named as a part of it."""
+    layer: Linear = _Linear(size, scale, name=name)(fan_in)
+    return layer
 
 
 def _layer_norm(name: str) -> nn.LayerNorm:
