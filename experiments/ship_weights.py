@@ -3,6 +3,7 @@
 Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
 says. The facts of its model card come from the run folder: how it was trained and what it reached
 right afterwards; for an earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it.
+The runs it went on from, of which `--before` has the records, are named too.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +23,27 @@ from sqn_jax.runlog import RunFolder
 WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
 
 
+def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
+    """Episodes and minutes of runs, from files of `record_run.py`."""
+    runs = [run for path in records for run in json.loads(path.read_text("utf-8"))["runs"]]
+    return [
+        {
+            "run": run["run"],
+            "seeds": run["config"]["num_seeds"],
+            "training_episodes": run["summary"]["episodes"],
+            "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
+            "device": run["summary"]["device"],
+        }
+        for run in runs
+    ]
+
+
 def card(
-    run_dir: Path, policy: Policy, checkpoint: int | None, evaluation: Path | None
+    run_dir: Path,
+    policy: Policy,
+    checkpoint: int | None,
+    evaluation: Path | None,
+    before: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
 
@@ -40,6 +61,7 @@ def card(
         "agent": policy.config.algo,
         "method": policy.config.method,
         "trained_on": Path(policy.config.map).stem,
+        "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
         "training_seed": policy.config.seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),
@@ -67,6 +89,7 @@ def main() -> None:
     parser.add_argument("--name", help="of a single run's policy (default its agent's)")
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
     parser.add_argument("--evaluation", type=Path, help="of that checkpoint")
+    parser.add_argument("--before", nargs="+", type=Path, default=[], help="records, first to last")
     options = parser.parse_args()
     if (options.checkpoint is None) != (options.evaluation is None):
         parser.error("--checkpoint and --evaluation belong together")
@@ -76,7 +99,7 @@ def main() -> None:
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir, options.checkpoint or "newest")
         named = dataclasses.replace(policy, name=options.name or policy.config.algo)
-        facts = card(run_dir, policy, options.checkpoint, options.evaluation)
+        facts = card(run_dir, policy, options.checkpoint, options.evaluation, options.before)
         write_policy(options.out, named, facts)
         print(f"wrote {options.out / named.name}.npz and .json")
 

@@ -1,7 +1,8 @@
 """Changing what a trained SQN decides between its skills, to see what each of them does.
 
-Each function returns a policy of the same form with other parameters in the last layer of the
-skill decision (paper eq. 4): it can be evaluated, recorded and drawn like any other.
+`fix_skill_weights` and `swap_skills` return a policy of the same form with other parameters in the
+last layer of the skill decision (paper eq. 4), `single_head` one of the R2D2 agent: each can be
+evaluated, recorded and drawn like any other, and training can start from it.
 """
 
 from __future__ import annotations
@@ -59,6 +60,36 @@ def swap_skills(policy: Policy, order: Sequence[int] | None = None) -> Policy:
         raise ValueError(f"order is {places}, expected a permutation of 0 to {num_skills - 1}")
     chosen = np.array(places)
     return _with_output(policy, lambda kernel, bias: (kernel[:, chosen], bias[chosen]))
+
+
+def single_head(policy: Policy, skill: int = 0) -> Policy:
+    """The R2D2 agent that does what one skill of an SQN does alone.
+
+    It has the perception and the layers of that skill, whose embedding (paper eq. 5) becomes part
+    of a bias; the other skills and the decision between them are gone.
+
+    Args:
+        policy: of an SQN.
+        skill: which, from 0.
+
+    Raises:
+        ValueError: the policy is no SQN, or has no such skill.
+    """
+    num_skills = _num_skills(policy)
+    if not 0 <= skill < num_skills:
+        raise ValueError(f"skill is {skill}, expected 0 to {num_skills - 1}")
+
+    def reduced(params: Any) -> Any:
+        modules = params["params"]
+        head, embedding = modules[f"skill_{skill}"], modules[f"skill_{skill}_embedding"]
+        hidden = head["hidden"]
+        bias = hidden["bias"] + embedding @ hidden["kernel"]
+        kept = {name: modules[name] for name in ("features", "perception")}
+        kept["skill_0"] = {**head, "hidden": {**hidden, "bias": bias}}
+        return {**params, "params": kept}
+
+    config = dataclasses.replace(policy.config, algo="r2d2")
+    return Policy(policy.name, config, tuple(reduced(params) for params in policy.params))
 
 
 def _num_skills(policy: Policy) -> int:

@@ -24,10 +24,11 @@ from sqn_jax.policies import Policy, load_policy, params_shapes
 from sqn_jax.runlog import write_json
 
 PREFIX = "pretrained:"
+SUFFIX = ".npz"
 
 
 def find_policy(word: str, checkpoint: int | str = "newest") -> Policy:
-    """A policy by the name a user gives: a run folder, or `pretrained:NAME`.
+    """A policy by the name a user gives: a run folder, `pretrained:NAME`, or a file NAME.npz.
 
     Args:
         word: the name.
@@ -36,17 +37,25 @@ def find_policy(word: str, checkpoint: int | str = "newest") -> Policy:
     Raises:
         ValueError: there is none, or it is damaged.
     """
+    if names_a_run(word):
+        return load_policy(Path(word), checkpoint)
+    if checkpoint != "newest":
+        raise ValueError(f"{word}: has no checkpoint {checkpoint}, expected newest")
     if word.startswith(PREFIX):
-        if checkpoint != "newest":
-            raise ValueError(f"{word}: has no checkpoint {checkpoint}, expected newest")
         return load_pretrained(word.removeprefix(PREFIX))
-    return load_policy(Path(word), checkpoint)
+    path = Path(word)
+    return read_policy(path.parent, path.stem)
+
+
+def names_a_run(word: str) -> bool:
+    """Whether a policy's name is that of a run folder, with all that a run leaves."""
+    return not (word.startswith(PREFIX) or word.endswith(SUFFIX))
 
 
 def pretrained_names() -> list[str]:
     """The policies that come with the package."""
     files = _folder().iterdir() if _folder().is_dir() else []
-    return sorted(file.name.removesuffix(".npz") for file in files if file.name.endswith(".npz"))
+    return sorted(file.name.removesuffix(SUFFIX) for file in files if file.name.endswith(SUFFIX))
 
 
 def load_pretrained(name: str) -> Policy:

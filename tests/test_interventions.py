@@ -14,8 +14,8 @@ from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.agent.networks import QOutput
 from sqn_jax.config import NetworkConfig, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
-from sqn_jax.interventions import fix_skill_weights, swap_skills
-from sqn_jax.policies import Policy
+from sqn_jax.interventions import fix_skill_weights, single_head, swap_skills
+from sqn_jax.policies import Policy, params_shapes
 
 CONFIG = TrainConfig(network=NetworkConfig(hidden_size=8, num_skills=3))
 NETWORK = make_network("sqn", CONFIG.network, NUM_ACTIONS)
@@ -28,10 +28,11 @@ def policy() -> Policy:
 
 
 def outputs(policy: Policy, index: int = 0) -> QOutput:
+    network = make_network(policy.config.algo, policy.config.network, NUM_ACTIONS)
     rng = np.random.default_rng(7)
     obs = Observation(ranges=rng.random((6, 2, 71)), goal=rng.random((6, 2, 2)))
     obs = jax.tree.map(lambda x: x.astype(np.float32), obs)
-    output: QOutput = NETWORK.apply(policy.params[index], obs, initial_carry(CONFIG.network, 2))[1]
+    output: QOutput = network.apply(policy.params[index], obs, initial_carry(CONFIG.network, 2))[1]
     return output
 
 
@@ -58,6 +59,23 @@ def test_a_skill_gets_the_weight_of_the_one_it_changes_places_with(policy: Polic
             after.skill_weights, before.skill_weights[..., places], rtol=1e-4, atol=1e-7
         )
         np.testing.assert_array_equal(after.skill_q_values, before.skill_q_values)
+
+
+@pytest.mark.parametrize("skill", [0, 1, 2])
+def test_a_single_head_has_the_values_of_its_skill(policy: Policy, skill: int) -> None:
+    left = single_head(policy, skill)
+    assert (left.config.algo, left.training_seeds) == ("r2d2", policy.training_seeds)
+    for index in range(2):
+        expected = outputs(policy, index).skill_q_values[:, :, skill]
+        np.testing.assert_allclose(outputs(left, index).q_values, expected, rtol=1e-4, atol=1e-4)
+    expected_shapes = params_shapes(dataclasses.replace(CONFIG, algo="r2d2"))
+    assert jax.tree.map(np.shape, left.params[0]) == jax.tree.map(np.shape, expected_shapes)
+
+
+@pytest.mark.parametrize("skill", [-1, 3])
+def test_a_single_head_is_that_of_a_skill_there_is(policy: Policy, skill: int) -> None:
+    with pytest.raises(ValueError, match=f"skill is {skill}, expected 0 to 2"):
+        single_head(policy, skill)
 
 
 def test_the_policy_that_was_given_stays_as_it_is(policy: Policy) -> None:

@@ -53,6 +53,16 @@ def test_a_policy_comes_back_bit_for_bit(folder: Path, policy: Policy) -> None:
     assert json.loads((folder / "small.json").read_text())["card"] == {"trained_on": "maze"}
 
 
+def test_it_is_found_by_the_name_of_its_file(folder: Path, policy: Policy) -> None:
+    found = pretrained.find_policy(str(folder / "small.npz"))
+    assert found.name == "small"
+    jax.tree.map(np.testing.assert_array_equal, found.params[0], policy.params[1])
+    with pytest.raises(ValueError, match=r"small\.npz: has no checkpoint best"):
+        pretrained.find_policy(str(folder / "small.npz"), "best")
+    with pytest.raises(ValueError, match="policy other: cannot be read"):
+        pretrained.find_policy(str(folder / "other.npz"))
+
+
 def test_every_damaged_or_missing_part_is_named_in_one_line(folder: Path) -> None:
     for name in ("small.npz", "small.json"):
         whole = (folder / name).read_bytes()

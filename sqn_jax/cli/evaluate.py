@@ -17,7 +17,12 @@ def evaluate(words: list[str]) -> int:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME; none: references")
+    add(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help="run folders, pretrained:NAME or files NAME.npz; none: references",
+    )
     add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
     add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")

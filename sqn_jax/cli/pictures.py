@@ -17,7 +17,7 @@ def report(words: list[str]) -> int:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--maps", nargs="+", help="names or files (default: the map of the first run)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
     add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
@@ -68,7 +68,7 @@ def render(words: list[str]) -> int:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("runs", nargs="*", metavar="RUN", help="run folders, or pretrained:NAME")
+    add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--map", default="maze", help="a name or a file (default maze)")
     add("--episodes", type=int, default=4, help="of each policy (default 4)")
     add("--tasks", choices=list(TASKS), default="points", help="default: points")

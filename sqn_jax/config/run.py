@@ -38,8 +38,8 @@ class TrainConfig:
     """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
     ("maze:7"), or several side by side, "maze,maze:0-14"; evaluated is the first."""
     start_from: str = ""
-    """A trained policy to start from in place of random parameters: a run folder, or
-    "pretrained:sqn". Its network and sensors must be those of this run."""
+    """A trained policy to start from in place of random parameters: a run folder,
+    "pretrained:sqn" or a file NAME.npz. Its network and sensors must be those of this run."""
     seed: int = 0
     """Seed of the first run."""
     num_seeds: int = 1

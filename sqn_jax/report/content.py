@@ -27,7 +27,7 @@ from sqn_jax.compare import (
 from sqn_jax.config import TrainConfig
 from sqn_jax.policies import Policy
 from sqn_jax.presets import PRESETS
-from sqn_jax.pretrained import PREFIX, find_policy
+from sqn_jax.pretrained import find_policy, names_a_run
 from sqn_jax.progress import episodes_bar
 from sqn_jax.report.episodes import Drive, Hard, hardest
 from sqn_jax.runlog import RunFolder
@@ -62,7 +62,7 @@ class Content:
 
 
 def read_runs(words: Sequence[str], checkpoint: int | str = "newest") -> list[Run]:
-    """Runs by the names a user gives: folders, or `pretrained:NAME`.
+    """Runs by the names a user gives: folders, `pretrained:NAME`, or files NAME.npz.
 
     Folders of the same name in different places are called as the user does.
 
@@ -85,7 +85,7 @@ def read_runs(words: Sequence[str], checkpoint: int | str = "newest") -> list[Ru
 
 def _read_run(word: str, checkpoint: int | str) -> Run:
     policy = find_policy(word, checkpoint)
-    if word.startswith(PREFIX):
+    if not names_a_run(word):
         return Run(word, policy, [], {})
     folder, _ = RunFolder.open(Path(word))
     return Run(policy.name, policy, folder.read_metrics(), _summary(folder.path))
