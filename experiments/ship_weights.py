@@ -1,9 +1,10 @@
 """Put the policies of finished runs into the package: python experiments/ship_weights.py RUN ...
 
 Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
-says. The facts of its model card come from the run folder: how it was trained and what it reached
-right afterwards; for an earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it.
-The runs it went on from, of which `--before` has the records, are named too.
+says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.npz. The facts of its
+model card come from the run folder: how it was trained and what it reached right afterwards; for an
+earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. The runs it went on from,
+of which `--before` has the records, are named too.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def card(
     policy: Policy,
     checkpoint: int | None,
     evaluation: Path | None,
-    before: Sequence[Path] = (),
+    before: Sequence[Path],
+    seed: int,
 ) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
 
@@ -63,7 +65,7 @@ def card(
         "trained_on": Path(policy.config.map).stem,
         "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
-        "training_seed": policy.config.seed,
+        "training_seed": seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),
         "versions": summary["versions"],
         "evaluation": [
@@ -87,6 +89,7 @@ def main() -> None:
     parser.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder (default the package's)")
     parser.add_argument("--name", help="of a single run's policy (default its agent's)")
+    parser.add_argument("--seed", type=int, help="of a run of several, which (default its first)")
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
     parser.add_argument("--evaluation", type=Path, help="of that checkpoint")
     parser.add_argument("--before", nargs="+", type=Path, default=[], help="records, first to last")
@@ -99,8 +102,12 @@ def main() -> None:
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir, options.checkpoint or "newest")
         named = dataclasses.replace(policy, name=options.name or policy.config.algo)
-        facts = card(run_dir, policy, options.checkpoint, options.evaluation, options.before)
-        write_policy(options.out, named, facts)
+        seed = policy.config.seed if options.seed is None else options.seed
+        if seed not in policy.training_seeds:
+            parser.error(f"--seed is {seed}, {run_dir} has {policy.training_seeds}")
+        told = (options.checkpoint, options.evaluation, options.before, seed)
+        facts = card(run_dir, policy, *told)
+        write_policy(options.out, named, facts, index=policy.training_seeds.index(seed))
         print(f"wrote {options.out / named.name}.npz and .json")
 
 

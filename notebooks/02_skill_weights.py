@@ -75,7 +75,7 @@ figures.picture(
 #
 # Every step is put into situations, by what can be measured:
 #
-# - **goal reachable** or **hidden**: in view and nearer than the reading around it (eq. 7 of the
+# - **goal reachable** or **hidden**: in view and nearer than the reading around it (eq. 8 of the
 #   paper),
 # - **blocked ahead**: all beams within 20 degrees of the heading read less than 1.5 m; **open
 #   ahead** otherwise,

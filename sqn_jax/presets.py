@@ -89,5 +89,5 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(),
     "smoke": _smoke(),
 }
-"""`quick` is the default, `best` trains on all kinds of maps for half an hour, `paper` follows the
+"""`quick` is the default, `best` trains on all kinds of maps, `paper` follows the
 paper to the letter, `smoke` is for tests."""

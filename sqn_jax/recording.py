@@ -145,7 +145,7 @@ class Episode:
     goal_distances: Floats
     """[T] m, in a straight line, after each step."""
     reachable: NDArray[np.bool_]
-    """[T] whether the goal was in view and not hidden after each step (paper eq. 7)."""
+    """[T] whether the goal was in view and not hidden after each step (paper eq. 8)."""
     collisions: NDArray[np.bool_]
     """[T] the move was refused."""
     covered_areas: Floats

@@ -348,7 +348,7 @@ def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     assert (env.forward_speed, env.backward_speed, env.turn_rate) == (2.5, 1.25, math.pi)
     assert env.time_step == 0.1
     assert env.velocity_noise == env.range_noise == env.near_goal_fraction == 0.0
-    # The reward (eq. 8).
+    # The reward (eq. 9).
     assert (env.reward_navigation, env.reward_exploration, env.reward_time) == (2.0, 1.0, 0.2)
     # One update a finished episode, sequences of the map's own length, R2D2 with all its parts.
     assert paper.updates_per_round == paper.num_envs

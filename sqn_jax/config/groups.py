@@ -59,11 +59,11 @@ class EnvConfig:
     near_goal_fraction: float = 0.0
     """Share of training tasks whose goal lies at one of the spawn points nearest to the start."""
     reward_navigation: float = 2.0
-    """Weight of the reachability-aware navigation term (paper eq. 8)."""
+    """Weight of the reachability-aware navigation term (paper eq. 9)."""
     reward_exploration: float = 1.0
-    """Weight of newly covered area, 1/m2 (paper eq. 6 and 8)."""
+    """Weight of newly covered area, 1/m2 (paper eq. 7 and 9)."""
     reward_time: float = 0.2
-    """Weight of the constant penalty of -1 a step (paper eq. 8)."""
+    """Weight of the constant penalty of -1 a step (paper eq. 9)."""
 
     def __post_init__(self) -> None:
         for name in ("max_range", "time_step", "goal_radius", "max_goal_distance", "coverage_cell"):

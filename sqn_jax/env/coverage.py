@@ -1,4 +1,4 @@
-"""The area the robot has seen: the paper's map coverage M (section III-C, eq. 6).
+"""The area the robot has seen: the paper's map coverage M (section III-C, eq. 7).
 
 A place counts as seen if it lies in the field of view and no farther than the reading of the beam
 nearest in angle: sectors, since single lines are 0.44 m apart at 5 m. Seen area is counted on a

@@ -4,7 +4,7 @@ A robot with range beams and the goal's distance and heading drives through an o
 
 Observation: `Observation(ranges [71], goal [2])`, every number in 0..1.
 Action: 0 stand still, 1 forward 2.5 m/s, 2 backward 1.25 m/s, 3 turn left pi rad/s, 4 turn right.
-Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 6 to 8).
+Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 7 to 9).
 End: never terminated; truncated after `max_steps` steps. Reaching the goal does not end an
 episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
 

@@ -1,4 +1,4 @@
-"""The reward of the paper (section III-C, eq. 6 to 8): navigation, exploration and time."""
+"""The reward of the paper (section III-C, eq. 7 to 9): navigation, exploration and time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jax import Array
 def goal_is_reachable(
     goal_distance: Array, goal_heading: Array, ranges: Array, *, field_of_view: float
 ) -> Array:
-    """Whether the goal is reachable from what the robot sees now: g in S_obs of eq. 7.
+    """Whether the goal is reachable from what the robot sees now: g in S_obs of eq. 8.
 
     Reachable means in the field of view and nearer than the reading of the beam nearest to the
     goal's direction; a goal close by behind a wall is not.
@@ -31,12 +31,12 @@ def goal_is_reachable(
 
 
 def navigation_reward(goal_distance: Array, reachable: Array) -> Array:
-    """exp(-d) while the goal is reachable, else 0 (eq. 7); d in m, so the unit is 1."""
+    """exp(-d) while the goal is reachable, else 0 (eq. 8); d in m, so the unit is 1."""
     return jnp.where(reachable, jnp.exp(-goal_distance), 0.0)
 
 
 def exploration_reward(newly_covered_area: Array) -> Array:
-    """Growth of the covered area (eq. 6), m2."""
+    """Growth of the covered area (eq. 7), m2."""
     return newly_covered_area
 
 
@@ -46,5 +46,5 @@ def time_reward() -> float:
 
 
 def total_reward(navigation: Array, exploration: Array, time: float, weights: Array) -> Array:
-    """Weighted sum of the three terms (eq. 8); `weights` [3] in the order of the arguments."""
+    """Weighted sum of the three terms (eq. 9); `weights` [3] in the order of the arguments."""
     return weights[0] * navigation + weights[1] * exploration + weights[2] * time

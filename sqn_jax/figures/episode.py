@@ -164,7 +164,7 @@ class Moment(NamedTuple):
 
 
 def reachability_example(
-    episodes: Episode | Sequence[Episode], *, title: str = "Is the goal reachable? (eq. 7)"
+    episodes: Episode | Sequence[Episode], *, title: str = "Is the goal reachable? (eq. 8)"
 ) -> Figure:
     """Draw what the navigation reward pays for: a goal that is near but hidden, and one in sight.
 

@@ -28,7 +28,7 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
     The panels from above: the skill decision, stacked (left out for an agent without skills); the
     value of the best action of each skill and of their weighted sum; the running sums of the
     weighted parts of the reward; the distance to the goal in a straight line, shaded while the goal
-    was reachable (paper eq. 7), with a tick for each refused move. A dotted line in all panels is
+    was reachable (paper eq. 8), with a tick for each refused move. A dotted line in all panels is
     the moment of arrival; the time axis goes on for a quarter of the way after it.
 
     Args:
