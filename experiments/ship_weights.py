@@ -3,7 +3,7 @@
 Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
 says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.npz. The facts of its
 model card come from the run folder: how it was trained and what it reached right afterwards; for an
-earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. The runs it went on from,
+earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. Runs it went on from,
 of which `--before` has the records, are named too.
 """
 
