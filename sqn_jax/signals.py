@@ -8,6 +8,7 @@ says what is going to happen, and ends the process where the main thread does no
 from __future__ import annotations
 
 import os
+import random
 import select
 import signal
 import sys
@@ -168,7 +169,7 @@ def _watch(reader: int, command: str, on_terminal: list[int]) -> None:
         if number == _CLOSE:
             return
         if number == _AGAIN:
-            time.sleep(0.02)
+            time.sleep(random.uniform(0.01, 0.1))  # Out of step with what swallowed it.
             signal.pthread_kill(threading.main_thread().ident or 0, first)
             os.read(reader, 1)  # Of the signal just sent, which is no second one.
             continue

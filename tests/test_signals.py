@@ -21,7 +21,15 @@ from sqn_jax.signals import Interrupted, collected, interruptible, last_words, s
 IN_PYTHON = "while True: time.sleep(0.01)"
 IN_COMPILED_CODE = "hashlib.pbkdf2_hmac('sha256', b'x', b'x', 500_000_000)"
 
-PROGRAM = """
+# Whoever runs the tests may have ignored SIGHUP, as nohup does, and children inherit that.
+HEED_HANGUP = """
+import signal
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+"""
+
+PROGRAM = (
+    HEED_HANGUP
+    + """
 import hashlib, sys, time
 from sqn_jax import signals
 from sqn_jax.signals import Interrupted, collected, interruptible, last_words, say_stopped
@@ -35,6 +43,7 @@ except Interrupted as stop:
     print("in order", flush=True)
     sys.exit(stop.exit_code)
 """
+)
 
 
 class Child:
@@ -163,7 +172,9 @@ def test_while_it_is_waited_for_a_second_signal_ends_at_once() -> None:
         assert "stopped at once by SIGINT" in err
 
 
-WITHOUT_TERMINAL = """
+WITHOUT_TERMINAL = (
+    HEED_HANGUP
+    + """
 import os, sys, time
 from sqn_jax.signals import collected, interruptible
 with interruptible("sqn"), collected("saving") as received:
@@ -175,6 +186,7 @@ with interruptible("sqn"), collected("saving") as received:
     with open(sys.argv[1], "w") as file:
         file.write(f"saved after {received}")
 """
+)
 
 
 def start_on_terminal(saved: Path) -> tuple[subprocess.Popen[bytes], int]:
@@ -198,7 +210,10 @@ def start_on_terminal(saved: Path) -> tuple[subprocess.Popen[bytes], int]:
 def test_a_terminal_that_is_closed_does_not_keep_from_saving(tmp_path: Path) -> None:
     process, terminal = start_on_terminal(tmp_path / "saved")
     os.close(terminal)
-    assert process.wait(timeout=60) == 0
+    try:
+        assert process.wait(timeout=60) == 0
+    finally:
+        process.kill()
     assert (tmp_path / "saved").read_text() == f"saved after [{signal.SIGHUP:d}]"
 
 
