@@ -48,6 +48,8 @@ class _Said:
     """What the main thread does before it ends; None where it may end at any time."""
     last: str | None = None
     """A line for the user once all has ended."""
+    on_terminal: tuple[int, ...] = ()
+    """Standard output and standard error, where they lead to a terminal."""
 
 
 _said = _Said()
@@ -65,6 +67,7 @@ def interruptible(command: str = "sqn") -> Iterator[None]:
         return
 
     def stop(number: int, _: FrameType | None) -> NoReturn:
+        _leave_terminal(number)
         raise Interrupted(number)
 
     def raise_again(lost: Any) -> None:
@@ -79,8 +82,8 @@ def interruptible(command: str = "sqn") -> Iterator[None]:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    on_terminal = [stream for stream in (1, 2) if os.isatty(stream)]
-    watch = threading.Thread(target=_watch, args=(reader, command, on_terminal), daemon=True)
+    _said.on_terminal = tuple(stream for stream in (1, 2) if os.isatty(stream))
+    watch = threading.Thread(target=_watch, args=(reader, command), daemon=True)
     watch.start()
     try:
         yield
@@ -109,9 +112,12 @@ def collected(waiting: str) -> Iterator[list[int]]:
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
-    before = {
-        each: signal.signal(each, lambda number, _: received.append(number)) for each in _heeded()
-    }
+
+    def keep(number: int, _: FrameType | None) -> None:
+        _leave_terminal(number)
+        received.append(number)
+
+    before = {each: signal.signal(each, keep) for each in _heeded()}
     _said.waiting = waiting
     try:
         yield received
@@ -149,12 +155,21 @@ def _heeded() -> list[signal.Signals]:
     return [each for each in STOPPING if not (nohup and each == signal.SIGHUP)]
 
 
-def _watch(reader: int, command: str, on_terminal: list[int]) -> None:
-    """Read the numbers of signals as they come, until told to close.
+def _leave_terminal(number: int) -> None:
+    """Upon SIGHUP let the streams that led to the terminal lead nowhere.
 
-    Without their terminal the streams that lead there go nowhere: to write to it would fail, and
-    keep the main thread from saving what there is.
+    To write to a terminal that is gone fails, and would keep the main thread from saving. Both
+    threads do this before they write: neither can wait for the other.
     """
+    if number == signal.SIGHUP:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in _said.on_terminal:
+            os.dup2(nowhere, stream)
+        os.close(nowhere)
+
+
+def _watch(reader: int, command: str) -> None:
+    """Read the numbers of signals as they come, until told to close."""
     first, deadline = 0, None
     while True:
         left = None if deadline is None else max(0.0, deadline - time.monotonic())
@@ -175,11 +190,7 @@ def _watch(reader: int, command: str, on_terminal: list[int]) -> None:
             continue
         if number not in STOPPING:
             continue
-        if number == signal.SIGHUP:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            for stream in on_terminal:
-                os.dup2(nowhere, stream)
-            os.close(nowhere)
+        _leave_terminal(number)
         if first:
             sys.stderr.write(f"\n{command}: stopped at once by {signal.Signals(number).name}\n")
             sys.stderr.flush()
