@@ -42,10 +42,10 @@ def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
 def card(
     run_dir: Path,
     policy: Policy,
+    seed: int,
     checkpoint: int | None,
     evaluation: Path | None,
     before: Sequence[Path],
-    seed: int,
 ) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
 
@@ -105,8 +105,7 @@ def main() -> None:
         seed = policy.config.seed if options.seed is None else options.seed
         if seed not in policy.training_seeds:
             parser.error(f"--seed is {seed}, {run_dir} has {policy.training_seeds}")
-        told = (options.checkpoint, options.evaluation, options.before, seed)
-        facts = card(run_dir, policy, *told)
+        facts = card(run_dir, policy, seed, options.checkpoint, options.evaluation, options.before)
         write_policy(options.out, named, facts, index=policy.training_seeds.index(seed))
         print(f"wrote {options.out / named.name}.npz and .json")
 

@@ -6,7 +6,6 @@ What needs PyTorch is left out where it is not installed.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import compiling_quickly
-from jax import Array
 
 from experiments import (
     bench_learner,
@@ -23,7 +21,7 @@ from experiments import (
 )
 from sqn_jax.agent import Episodes, gru, make_network, networks, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, make_optimizer
-from sqn_jax.agent.linear import Branches, Linear, affine
+from sqn_jax.agent.linear import one_by_one
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.env import Observation
@@ -238,11 +236,6 @@ def test_operations_of_an_update_are_those_of_the_traced_program(
     algo: Any, burn_in_length: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the network as it is written: layer by layer, even where two become one."""
-
-    def one_by_one(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
-        outputs = branches.outputs()
-        return tuple(affine(outputs, *layer) for layer in following)
-
     for module in (gru, networks):
         monkeypatch.setattr(module, "then", one_by_one)
     config = dataclasses.replace(LEARNER, burn_in_length=burn_in_length)

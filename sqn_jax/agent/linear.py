@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
@@ -90,16 +91,21 @@ def then(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
     apart = rows * sum(layer.kernel.size for layer in (*branches.layers, *following))
     at_once = ahead * (rows * given + sum(layer.kernel.size for layer in branches.layers))
     if apart <= at_once:
-        outputs = branches.outputs()
-        return tuple(affine(outputs, *layer) for layer in following)
+        return one_by_one(branches, following)
     inputs = jnp.concatenate(branches.inputs, axis=-1)
     return tuple(affine(inputs, *_composed(branches.layers, layer)) for layer in following)
 
 
+def one_by_one(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
+    """What `then` returns, layer by layer, as a network is written."""
+    outputs = branches.outputs()
+    return tuple(affine(outputs, *layer) for layer in following)
+
+
 def _composed(first: Sequence[Linear], second: Linear) -> Linear:
     """One layer [D, F] for those of `first`, side by side, and `second` [E, F] after them."""
-    ends = [sum(layer.bias.size for layer in first[: count + 1]) for count in range(len(first))]
-    pieces = jnp.split(second.kernel, ends[:-1])
+    *ends, _ = accumulate(layer.bias.size for layer in first)
+    pieces = jnp.split(second.kernel, ends)
     pairs = list(zip(first, pieces, strict=True))
     kernel = jnp.concatenate([layer.kernel @ piece for layer, piece in pairs])
     return Linear(kernel, second.bias + sum(layer.bias @ piece for layer, piece in pairs))
