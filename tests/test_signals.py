@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import pty
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from pathlib import Path
@@ -175,8 +173,9 @@ def test_while_it_is_waited_for_a_second_signal_ends_at_once() -> None:
 WITHOUT_TERMINAL = (
     HEED_HANGUP
     + """
-import os, sys, time
+import fcntl, os, sys, termios, time
 from sqn_jax.signals import collected, interruptible
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # the terminal is this session's: closing it hangs it up
 with interruptible("sqn"), collected("saving") as received:
     print("ready", flush=True)
     while not received:
@@ -198,7 +197,6 @@ def start_on_terminal(saved: Path) -> tuple[subprocess.Popen[bytes], int]:
         stdout=slave,
         stderr=slave,
         start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
     os.close(slave)
     told = b""
