@@ -4,7 +4,9 @@ Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:
 says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.npz. The facts of its
 model card come from the run folder: how it was trained and what it reached right afterwards; for an
 earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. Runs it went on from,
-of which `--before` has the records, are named too.
+of which `--before` has the records, are named too. `--average POLICY SHARE` takes that share of
+another policy's parameters and the rest of the run's: what is in between a policy and what became
+of it in further training can have the merits of both.
 """
 
 from __future__ import annotations
@@ -16,9 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from experiments.common import run
-from sqn_jax.policies import Policy, load_policy
-from sqn_jax.pretrained import write_policy
+from sqn_jax.policies import Policy, load_policy, require_same_network
+from sqn_jax.pretrained import find_policy, write_policy
 from sqn_jax.runlog import RunFolder
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
@@ -39,6 +43,27 @@ def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
     ]
 
 
+def averaged(policy: Policy, word: str, share: float) -> Policy:
+    """A policy whose parameters are by a share those of another, which has one training seed.
+
+    Raises:
+        ValueError: there is no such policy, it has several seeds or another network, or the share
+            is not between 0 and 1.
+    """
+    other = find_policy(word)
+    require_same_network(other, policy.config)
+    if len(other.params) > 1:
+        raise ValueError(f"{word}: holds several training seeds, expected one")
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"--average: a share of {share}, expected between 0 and 1")
+
+    def mixed(theirs: jax.Array, own: jax.Array) -> jax.Array:
+        return share * theirs + (1.0 - share) * own
+
+    params = tuple(jax.tree.map(mixed, other.params[0], own) for own in policy.params)
+    return dataclasses.replace(policy, params=params)
+
+
 def card(
     run_dir: Path,
     policy: Policy,
@@ -46,8 +71,11 @@ def card(
     checkpoint: int | None,
     evaluation: Path | None,
     before: Sequence[Path],
+    average: Sequence[str],
 ) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
+
+    Of an average nothing is known that is not in `evaluation`, a file of its own.
 
     Raises:
         ValueError: the run is not finished.
@@ -57,14 +85,15 @@ def card(
     summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
     rows = RunFolder(run_dir).read_metrics()
     last = next(row for row in rows if row["chunk"] == (checkpoint or rows[-1]["chunk"]))
-    file = evaluation or run_dir / "evaluation.json"
-    found = json.loads(file.read_text(encoding="utf-8"))["results"]
+    file = evaluation or (None if average else run_dir / "evaluation.json")
+    found = json.loads(file.read_text(encoding="utf-8"))["results"] if file else []
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
         "trained_on": Path(policy.config.map).stem,
         "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
+        "averaged_with": {"policy": average[0], "share": float(average[1])} if average else None,
         "training_seed": seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),
         "versions": summary["versions"],
@@ -91,21 +120,34 @@ def main() -> None:
     parser.add_argument("--name", help="of a single run's policy (default its agent's)")
     parser.add_argument("--seed", type=int, help="of a run of several, which (default its first)")
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
-    parser.add_argument("--evaluation", type=Path, help="of that checkpoint")
+    parser.add_argument("--average", nargs=2, metavar=("POLICY", "SHARE"), default=())
+    parser.add_argument("--evaluation", type=Path, help="of that checkpoint or average")
     parser.add_argument("--before", nargs="+", type=Path, default=[], help="records, first to last")
     options = parser.parse_args()
-    if (options.checkpoint is None) != (options.evaluation is None):
-        parser.error("--checkpoint and --evaluation belong together")
-    if (options.name or options.checkpoint) and len(options.run_dirs) > 1:
-        parser.error("--name and --checkpoint go with a single run")
+    if options.checkpoint is not None and options.evaluation is None:
+        parser.error("--checkpoint takes an --evaluation of it")
+    if options.evaluation and options.checkpoint is None and not options.average:
+        parser.error("--evaluation goes with --checkpoint or --average")
+    if (options.name or options.checkpoint or options.average) and len(options.run_dirs) > 1:
+        parser.error("--name, --checkpoint and --average go with a single run")
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir, options.checkpoint or "newest")
+        if options.average:
+            policy = averaged(policy, options.average[0], float(options.average[1]))
         named = dataclasses.replace(policy, name=options.name or policy.config.algo)
         seed = policy.config.seed if options.seed is None else options.seed
         if seed not in policy.training_seeds:
             parser.error(f"--seed is {seed}, {run_dir} has {policy.training_seeds}")
-        facts = card(run_dir, policy, seed, options.checkpoint, options.evaluation, options.before)
+        facts = card(
+            run_dir,
+            policy,
+            seed,
+            options.checkpoint,
+            options.evaluation,
+            options.before,
+            options.average,
+        )
         write_policy(options.out, named, facts, index=policy.training_seeds.index(seed))
         print(f"wrote {options.out / named.name}.npz and .json")
 
