@@ -4,8 +4,8 @@ Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:
 says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.npz. The facts of its
 model card come from the run folder: how it was trained and what it reached right afterwards; for an
 earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. Runs it went on from,
-of which `--before` has the records, are named too. `--average POLICY SHARE` takes that share of
-another policy's parameters and the rest of the run's: what is in between a policy and what became
+of which `--before` has records or cards, are named too. `--average POLICY SHARE` takes a share of
+another policy and the rest of the run: what is in between a policy and what became
 of it in further training can have the merits of both.
 """
 
@@ -29,18 +29,27 @@ WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
 
 
 def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
-    """Episodes and minutes of runs, from files of `record_run.py`."""
-    runs = [run for path in records for run in json.loads(path.read_text("utf-8"))["runs"]]
-    return [
-        {
-            "run": run["run"],
-            "seeds": run["config"]["num_seeds"],
-            "training_episodes": run["summary"]["episodes"],
-            "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
-            "device": run["summary"]["device"],
-        }
-        for run in runs
-    ]
+    """Episodes and minutes of runs, from files of `record_run.py` and the cards of policies."""
+    runs: list[dict[str, Any]] = []
+    for path in records:
+        told = json.loads(path.read_text("utf-8"))
+        if "card" in told:
+            before = told["card"]
+            facts = ("training_episodes", "training_minutes", "device")
+            runs += before["went_on_from"]
+            runs.append({"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts})
+            continue
+        runs += [
+            {
+                "run": run["run"],
+                "seeds": run["config"]["num_seeds"],
+                "training_episodes": run["summary"]["episodes"],
+                "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
+                "device": run["summary"]["device"],
+            }
+            for run in told["runs"]
+        ]
+    return runs
 
 
 def averaged(policy: Policy, word: str, share: float) -> Policy:
@@ -93,9 +102,12 @@ def card(
         "trained_on": Path(policy.config.map).stem,
         "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
-        "averaged_with": {"policy": average[0], "share": float(average[1])} if average else None,
+        "averaged_with": (
+            {"policy": Path(average[0]).stem, "share": float(average[1])} if average else None
+        ),
         "training_seed": seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),
+        "device": summary["device"],
         "versions": summary["versions"],
         "evaluation": [
             {
@@ -122,7 +134,7 @@ def main() -> None:
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
     parser.add_argument("--average", nargs=2, metavar=("POLICY", "SHARE"), default=())
     parser.add_argument("--evaluation", type=Path, help="of that checkpoint or average")
-    parser.add_argument("--before", nargs="+", type=Path, default=[], help="records, first to last")
+    parser.add_argument("--before", nargs="+", type=Path, default=[], help="records or cards")
     options = parser.parse_args()
     if options.checkpoint is not None and options.evaluation is None:
         parser.error("--checkpoint takes an --evaluation of it")
