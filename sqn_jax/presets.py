@@ -20,7 +20,7 @@ def _quick() -> TrainConfig:
     """Recurrent PQN within the budget of two CPU cores."""
     return TrainConfig(
         method="pqn",
-        total_episodes=102_400,
+        total_episodes=71_680,
         num_envs=256,
         rounds_per_chunk=2,
         env=EnvConfig(near_goal_fraction=0.3),
@@ -34,6 +34,7 @@ def _quick() -> TrainConfig:
             discount=0.985,
             average_share=0.05,
             restart_at_goal=True,
+            advantage_learning=0.8,
         ),
         exploration=ExplorationConfig(epsilon_start=0.4, epsilon_end=0.02, ladder=True),
     )
@@ -48,8 +49,8 @@ def _best() -> TrainConfig:
     return dataclasses.replace(
         quick,
         map="maze*8,maze:0-24,column:0-2,forest:0-6,cave:0-11",
+        total_episodes=102_400,
         randomization=RandomizationConfig(mirror=True),
-        learner=dataclasses.replace(quick.learner, advantage_learning=0.8),
         # Half of the run with hardly any chance: robots get stuck while there is time to learn.
         exploration=dataclasses.replace(quick.exploration, decay_fraction=0.5),
     )
