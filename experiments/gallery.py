@@ -55,15 +55,13 @@ def reachability() -> Any:
 
 def timeline() -> Any:
     """Skills, values and rewards along an episode."""
-    return figures.episode_timeline(episodes("sqn", "maze", 8)[0], title="SQN on the maze")
+    return figures.episode_timeline(episodes("best", "cave", 6)[0], title="SQN in the cave")
 
 
 def skills() -> Any:
     """Which skill decides where, on every map."""
-    driven = [episode for name in PAPER_MAPS[:3] for episode in episodes("sqn", name, 8)[:6]]
-    return figures.skill_trajectories(
-        [*driven, episodes("sqn", "cave", 1)[0]], title="Weights of the two skills along the way"
-    )
+    driven = [episode for name in PAPER_MAPS for episode in episodes("best", name, 6)]
+    return figures.skill_trajectories(driven, title="Weights of the two skills along the way")
 
 
 def agents() -> Any:

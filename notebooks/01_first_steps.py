@@ -217,9 +217,9 @@ Film(gif(episode, count=4 if SMALL else 80, width_px=500))
 # - The maze is the map that asks for more than heading for the goal: the way between evaluation
 #   points is 1.72 times the straight line there, 1.01 on the column map and 1.08 in the forest. The
 #   cave asks for as much of that, 1.92, over 110.1 m.
-# - Random actions lose reward, -0.09 a step; the trained policy gets 1.16 a step and reaches 97 of
-#   100 goals, in 183 steps on average with failures at the limit. This is one training seed.
+# - Random actions lose reward, -0.09 a step; the trained policy gets 1.22 a step and reaches 96 of
+#   100 goals, in 171 steps on average with failures at the limit. This is one training seed.
 # - The speed printed above is that of the machine this was run on, beside other work; yours will
 #   differ.
-# - In the episode drawn, the first skill has nearly all of the weight all the way. What the weights
+# - In the episode drawn, the second skill has nearly all of the weight all the way. What the weights
 #   mean is the subject of the next notebook.
