@@ -129,8 +129,9 @@ def test_the_pieces_of_a_step_add_up_to_the_step_itself() -> None:
     room = small_room(12)
     start, action_key = jax.random.split(jax.random.key(3))
     _, state = navigation.reset(start, room)
+    pieces = {name: jax.jit(piece) for name, piece in bench_breakdown.PIECES.items()}
     for action in jax.random.randint(action_key, (12,), 0, 5):
-        ends = {name: piece(state, action, room) for name, piece in bench_breakdown.PIECES.items()}
+        ends = {name: piece(state, action, room) for name, piece in pieces.items()}
         state, (obs, _) = ends["whole step"]
         for name in ("motion", "motion, rays", "motion, rays, coverage"):
             np.testing.assert_allclose(ends[name][0].pose, state.pose, atol=1e-6)
