@@ -129,8 +129,9 @@ def test_noise_set_afterwards_is_the_noise_of_a_world_made_with_it(unit: Any) ->
     keys = evaluate.episode_keys(key, 20)
     worlds = [evaluate.start_by_hand(keys, world) for world in (made, later, quiet)]
     actions = jnp.arange(20) % 5
+    step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, None)))
     stepped = [
-        jax.vmap(step, in_axes=(0, 0, 0, None))(step_keys[0], state, actions, world)
+        step_all(step_keys[0], state, actions, world)
         for (step_keys, _, state), world in zip(worlds, (made, later, quiet), strict=True)
     ]
     for one, other in zip(jax.tree.leaves(stepped[0]), jax.tree.leaves(stepped[1]), strict=True):
