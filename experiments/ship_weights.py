@@ -113,7 +113,7 @@ def card(
             {
                 "map": entry["map"],
                 "tasks": entry["tasks"],
-                "episodes": entry["episodes"],
+                "episodes": entry["episodes"] * len(entry["eval_seeds"]),
                 "goal_radius_m": entry["goal_radius"],
                 "success": entry["success"],
                 "time_steps": entry["time_steps"],

@@ -270,11 +270,11 @@ paths_of("as trained" if SMALL else "radius 0.2 m", load_map("maze"), max_panels
 #   shuttles in a room, or circles a piece of furniture, and does not go through the door if that
 #   leads away from the goal. The maze has passages of the width of its corridors, but no doors in
 #   the wall of a room.
-# - **Another robot on the maze.** Half the forward speed costs 0.970 [0.936, 0.986] to 0.905
-#   [0.856, 0.938], half the turn rate with it gives 0.865 [0.811, 0.906], readings up to 3 m 0.760
-#   [0.696, 0.814]. What is hard is a larger body: 0.440 [0.373, 0.509] at a radius of 0.2 m, with
-#   203.5 refused moves an episode, and 0.065 at 0.3 m. The policy has learnt to pass corners as
-#   close as its own radius allowed, and does not see that it is larger now.
+# - **Another robot on the maze**, up to 600 steps. Half the speed costs 0.970 [0.936, 0.986] to
+#   0.905 [0.856, 0.938], half the turn rate with it gives 0.865 [0.811, 0.906], readings up to 3 m
+#   0.760 [0.696, 0.814]. What is hard is a larger body: 0.440 [0.373, 0.509] at a radius of 0.2 m,
+#   with 203.5 refused moves an episode, and 0.065 at 0.3 m. The policy has learnt to pass corners
+#   as close as its own radius allowed, and does not see that it is larger now.
 # - So measure before you trust, with the wall follower beside it; then train on a map of the kind
 #   and with the robot you have. One training seed, 200 tasks a row.
 
