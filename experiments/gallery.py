@@ -97,7 +97,7 @@ STILLS: dict[str, Callable[[], Any]] = {
         *(learning_curve, learning_curves, robustness),
     )
 }
-FILMS = {"maze": ("sqn", 8), "cave": ("best", 1)}
+FILMS = {"maze": ("sqn", 8), "cave": ("best", 6)}
 """Maps that a film is made of, who drives, and how many episodes; the first is shown."""
 
 

@@ -5,8 +5,8 @@ says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.n
 model card come from the run folder: how it was trained and what it reached right afterwards; for an
 earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. Runs it went on from,
 of which `--before` has records or cards, are named too. `--average POLICY SHARE` takes a share of
-another policy and the rest of the run: what is in between a policy and what became
-of it in further training can have the merits of both.
+another policy and the rest of the run: what is in between a policy and what became of it in further
+training can have the merits of both.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
 
 def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
     """Episodes and minutes of runs, from files of `record_run.py` and the cards of policies."""
-    runs: list[dict[str, Any]] = []
-    for path in records:
-        told = json.loads(path.read_text("utf-8"))
-        if "card" in told:
-            before = told["card"]
-            facts = ("training_episodes", "training_minutes", "device")
-            runs += before["went_on_from"]
-            runs.append({"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts})
-            continue
-        runs += [
-            {
-                "run": run["run"],
-                "seeds": run["config"]["num_seeds"],
-                "training_episodes": run["summary"]["episodes"],
-                "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
-                "device": run["summary"]["device"],
-            }
-            for run in told["runs"]
-        ]
-    return runs
+    return [run for path in records for run in _runs_of(path)]
+
+
+def _runs_of(path: Path) -> list[dict[str, Any]]:
+    told = json.loads(path.read_text("utf-8"))
+    if "card" in told:
+        before = told["card"]
+        facts = ("training_episodes", "training_minutes", "device")
+        last = {"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts}
+        return [*before["went_on_from"], last]
+    return [
+        {
+            "run": run["run"],
+            "seeds": run["config"]["num_seeds"],
+            "training_episodes": run["summary"]["episodes"],
+            "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
+            "device": run["summary"]["device"],
+        }
+        for run in told["runs"]
+    ]
 
 
 def averaged(policy: Policy, word: str, share: float) -> Policy:
@@ -80,7 +80,7 @@ def card(
     checkpoint: int | None,
     evaluation: Path | None,
     before: Sequence[Path],
-    average: Sequence[str],
+    average: tuple[str, float] | None,
 ) -> dict[str, Any]:
     """What a user of the policy should know, from its run folder.
 
@@ -103,7 +103,7 @@ def card(
         "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
         "averaged_with": (
-            {"policy": Path(average[0]).stem, "share": float(average[1])} if average else None
+            {"policy": Path(average[0]).stem, "share": average[1]} if average else None
         ),
         "training_seed": seed,
         "training_minutes": round(last["wall_seconds"] / 60, 1),
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--name", help="of a single run's policy (default its agent's)")
     parser.add_argument("--seed", type=int, help="of a run of several, which (default its first)")
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
-    parser.add_argument("--average", nargs=2, metavar=("POLICY", "SHARE"), default=())
+    parser.add_argument("--average", nargs=2, metavar=("POLICY", "SHARE"))
     parser.add_argument("--evaluation", type=Path, help="of that checkpoint or average")
     parser.add_argument("--before", nargs="+", type=Path, default=[], help="records or cards")
     options = parser.parse_args()
@@ -142,11 +142,12 @@ def main() -> None:
         parser.error("--evaluation goes with --checkpoint or --average")
     if (options.name or options.checkpoint or options.average) and len(options.run_dirs) > 1:
         parser.error("--name, --checkpoint and --average go with a single run")
+    average = (options.average[0], float(options.average[1])) if options.average else None
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir, options.checkpoint or "newest")
-        if options.average:
-            policy = averaged(policy, options.average[0], float(options.average[1]))
+        if average:
+            policy = averaged(policy, *average)
         named = dataclasses.replace(policy, name=options.name or policy.config.algo)
         seed = policy.config.seed if options.seed is None else options.seed
         if seed not in policy.training_seeds:
@@ -158,7 +159,7 @@ def main() -> None:
             options.checkpoint,
             options.evaluation,
             options.before,
-            options.average,
+            average,
         )
         write_policy(options.out, named, facts, index=policy.training_seeds.index(seed))
         print(f"wrote {options.out / named.name}.npz and .json")

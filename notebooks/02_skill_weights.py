@@ -71,7 +71,7 @@ longest = max(driven[MAPS[-1]][:20], key=lambda e: (e.success, e.time_steps))
 figures.picture(figures.episode_timeline(longest, title="The longest way to a goal"))
 
 # %%
-shown = [*episodes[:6], *(driven["cave"][:6] if "cave" in driven else ())]
+shown = [episode for those in driven.values() for episode in those[:6]]
 figures.picture(figures.skill_trajectories(shown, title="Where which skill has the weight"))
 
 # %% [markdown]
