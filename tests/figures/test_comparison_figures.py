@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawing import check_texts, drawn
 from episodes import episode, walled_room
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.patches import Circle, Polygon
 from matplotlib.text import Text
-from test_figures import check_texts
 
 from sqn_jax import figures
 from sqn_jax.figures.gallery import spread_steps
@@ -123,8 +122,7 @@ def test_each_map_has_its_patterns_and_letters_say_where_they_were_taken() -> No
         assert [x for x, _ in letters.values()] == pytest.approx(
             [0.5, 0.5 + last / 20, 0.5 + last / 10]
         )
-    FigureCanvasAgg(figure).draw()
-    check_texts(figure)
+    check_texts(drawn(figure))
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
@@ -158,6 +156,7 @@ def gate_rows(entropies: list[Any], skills: int = 2, **more: list[Any]) -> list[
     return told
 
 
+@pytest.mark.usefixtures("full_pixels")
 def test_the_entropy_is_a_share_of_what_the_number_of_skills_allows() -> None:
     """log 2 = 0.6931 and log 4 = 1.3863 nat are 1; NaN, before the first update, leaves a gap."""
     runs = {
@@ -165,7 +164,7 @@ def test_the_entropy_is_a_share_of_what_the_number_of_skills_allows() -> None:
         "four": gate_rows([1.38629436, 0.69314718], skills=4),
     }
     figure = figures.gate_entropy(runs, title="gates")
-    FigureCanvasAgg(figure).draw()
+    drawn(figure)
     entropy, distance = figure.axes
     np.testing.assert_allclose(entropy.lines[0].get_ydata(), [np.nan, 1.0, 0.5])
     np.testing.assert_allclose(entropy.lines[1].get_ydata(), [1.0, 0.5])
