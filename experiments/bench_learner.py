@@ -39,6 +39,7 @@ Name = tuple[str, str]
 
 PRODUCT = "matrix product"
 JAX, SAMPLING = "JAX", "JAX, with sampling"
+JAX_AS_TRAINED = "JAX, with the options of training"
 STORED_BATCHES = 4
 """The replay that is drawn from holds this many times an update's episodes."""
 
@@ -141,7 +142,7 @@ def drawn_program(problem: Problem, mesh: Mesh | None) -> Program:
     robots: Any = PartitionSpec(None, devices.AXIS)
     steps: Any = PartitionSpec(None, None, devices.AXIS)
     divided = (Episodes(steps, steps, steps, steps, robots), robots)
-    scan = _scan(update, mesh, WHOLE, divided, (robots, WHOLE))
+    scan = _scan(problem, update, mesh, WHOLE, divided, (robots, WHOLE))
     placed = devices.place(batches, mesh, divided)
     return _carried_on(
         lambda state, turn: scan(state, placed), devices.place(problem.learner, mesh)
@@ -153,7 +154,7 @@ def sampling_program(problem: Problem, mesh: Mesh | None) -> Program:
     # The scan body of `r2d2.learn`, which without it would also store a round of new episodes.
     update = partial(r2d2._update, **_static(problem, mesh), discount=None)
     held = (WHOLE, train.runner_specs(problem.config).memory)
-    scan = _scan(update, mesh, held, WHOLE, WHOLE)
+    scan = _scan(problem, update, mesh, held, WHOLE, WHOLE)
     num_updates = problem.weights.shape[0]
     return _carried_on(
         lambda state, turn: scan(state, jax.random.split(jax.random.key(turn), num_updates)),
@@ -173,14 +174,17 @@ def _static(problem: Problem, mesh: Mesh | None) -> dict[str, Any]:
     }
 
 
-def _scan(update: Any, mesh: Mesh | None, held: Any, given: Any, told: Any) -> Any:
+def _scan(
+    problem: Problem, update: Any, mesh: Mesh | None, held: Any, given: Any, told: Any
+) -> Any:
     """A compiled scan of updates; how state, inputs and results are divided between devices."""
     scan = partial(jax.lax.scan, update)
     if mesh is not None:
         scan = jax.shard_map(
             scan, mesh=mesh, in_specs=(held, given), out_specs=(held, told), check_vma=False
         )
-    return jax.jit(scan, donate_argnums=0)
+    options = devices.compiler_options(problem.config)
+    return jax.jit(scan, donate_argnums=0, compiler_options=options)
 
 
 def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Program:
@@ -195,11 +199,18 @@ def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Pr
     return program
 
 
-def product_program(size: int) -> Program:
-    """A product of two float32 matrices [size, size] in JAX."""
+def product_programs(size: int, options: dict[str, str | bool]) -> dict[Name, Program]:
+    """A product of two float32 matrices [size, size] in JAX, compiled as usual and with options."""
     left, right = jax.random.normal(jax.random.key(0), (2, size, size))
-    multiply = jax.jit(jnp.matmul)
-    return lambda turn: multiply(left, right)
+
+    def program(**how: Any) -> Program:
+        multiply = jax.jit(jnp.matmul, **how)
+        return lambda turn: multiply(left, right)
+
+    found: dict[Name, Program] = {(PRODUCT, JAX): program()}
+    if options:
+        found[PRODUCT, JAX_AS_TRAINED] = program(compiler_options=options)
+    return found
 
 
 def torch_programs(
@@ -310,7 +321,8 @@ def measure(
         algo: make_problem(dataclasses.replace(config, algo=algo), env_params, num_updates)
         for algo in algos
     }
-    programs: dict[Name, Program] = {(PRODUCT, JAX): product_program(product_size)}
+    options = devices.compiler_options(dataclasses.replace(config, method="r2d2"))
+    programs = product_programs(product_size, options)
     for algo, problem in problems.items():
         for mesh in devices.one_and_all():
             suffix = "" if mesh is None else f", {mesh.size} devices"

@@ -69,18 +69,18 @@ def compare_simulators(map_name: str) -> dict[str, Any]:
 def compare_recurrences(size: tuple[int, int, int], repeats: int) -> dict[str, float]:
     """Milliseconds of scans and kernels, and how far the kernels are from scans in float32."""
     seeds, steps, robots = size
-    keys = jax.random.split(jax.random.key(0), 9)
+    keys = jax.random.split(jax.random.key(0), 7)
     shape = (seeds, steps, robots, HIDDEN)
-    projected = tuple(jax.random.normal(key, shape) for key in keys[:3])
-    carry = jax.random.uniform(keys[3], (seeds, robots, HIDDEN), minval=-1.0)
+    projected = jax.random.normal(keys[0], (*shape[:-1], 3 * HIDDEN))
+    carry = jax.random.uniform(keys[1], (seeds, robots, HIDDEN), minval=-1.0)
     square = (seeds, HIDDEN, HIDDEN)
-    kernels = tuple(jax.random.normal(key, square) / HIDDEN**0.5 for key in keys[4:7])
-    bias = jax.random.normal(keys[7], (seeds, HIDDEN))
+    kernels = tuple(jax.random.normal(key, square) / HIDDEN**0.5 for key in keys[2:5])
+    bias = jax.random.normal(keys[5], (seeds, HIDDEN))
     forwards = (projected, carry, kernels, bias)
     with jax.default_matmul_precision("highest"):
         exact = jax.jit(jax.vmap(gru._scan_forward))(*forwards)
         previous = jnp.concatenate([carry[:, None], exact[0][:, :-1]], axis=1)
-        backwards = (jax.random.normal(keys[8], shape), previous, exact[1:], kernels)
+        backwards = (jax.random.normal(keys[6], shape), previous, exact[1:], kernels)
         exact_back = jax.jit(jax.vmap(gru._scan_backward))(*backwards)
     programs = {
         "scan_forward": partial(jax.jit(jax.vmap(gru._scan_forward)), *forwards),

@@ -33,7 +33,7 @@ from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shares import mean, own_share
 from sqn_jax.config import TrainConfig
-from sqn_jax.devices import AXIS, place, placed_shapes
+from sqn_jax.devices import AXIS, compiler_options, place, placed_shapes
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.rollout import (
     Fleet,
@@ -352,7 +352,8 @@ def compile_chunk(
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), mesh)
     runner = runner_shapes(env_params, config, mesh)
-    program = compiled_train_chunk.lower(runner, world, config, mesh).compile()
+    lowered = compiled_train_chunk.lower(runner, world, config, mesh)
+    program = lowered.compile(compiler_options=compiler_options(config))
     return program, time.perf_counter() - started
 
 

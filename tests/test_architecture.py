@@ -89,7 +89,7 @@ DEVICE_LIBRARIES = {"chex", "flax", "jax", "jaxlib", "optax", "orbax"}
 PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING_ROOMS = {"figures", "render"}
 JIT_MODULES = {
-    *("sqn_jax.train", "sqn_jax.evaluate", "sqn_jax.recording"),
+    *("sqn_jax.train", "sqn_jax.evaluate", "sqn_jax.recording", "sqn_jax.devices"),
     *("experiments.bench_simulator", "experiments.bench_learner", "experiments.bench_breakdown"),
     "experiments.check_gpu",
     "notebooks.01_first_steps",

@@ -19,9 +19,8 @@ from experiments import (
     bench_learner,
     operations,
 )
-from sqn_jax.agent import Episodes, gru, make_network, networks, r2d2, replay
+from sqn_jax.agent import Episodes, gru, linear, make_network, networks, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, make_optimizer
-from sqn_jax.agent.linear import one_by_one
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.env import Observation
@@ -219,9 +218,10 @@ def operations_in(jaxpr: Any) -> int:
             (contracted, _), _ = equation.params["dimension_numbers"]
             left = equation.invars[0].aval.shape
             inner = np.prod([left[axis] for axis in contracted])
-            # A product with a row of ones is a sum, not one of the network's products.
-            is_sum = left[0] == 1 and len(left) == 2
-            total += 0 if is_sum else int(2 * np.prod(equation.outvars[0].aval.shape) * inner)
+            right = equation.invars[1].aval.shape
+            # A product with a row of ones is a sum, one with a vector makes a bias.
+            is_other = (left[0] == 1 and len(left) == 2) or min(len(left), len(right)) < 2
+            total += 0 if is_other else int(2 * np.prod(equation.outvars[0].aval.shape) * inner)
         for value in equation.params.values():
             for inside in value if isinstance(value, tuple | list) else (value,):
                 program = getattr(inside, "jaxpr", inside)
@@ -230,14 +230,30 @@ def operations_in(jaxpr: Any) -> int:
     return total
 
 
+def as_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers with inputs of their own one by one, and layers in a row one after the other."""
+
+    def apart(inputs: Any, layers: Any) -> Any:
+        *ends, _ = np.cumsum([layer.kernel.shape[0] for layer in layers])
+        pieces = zip(jnp.split(inputs, ends, axis=-1), layers, strict=True)
+        return jnp.concatenate([linear.affine(x, *layer) for x, layer in pieces], axis=-1)
+
+    def one_by_one(branches: Any, following: Any) -> Any:
+        return linear.affine(branches.outputs(), *following)
+
+    for module in (linear, networks):
+        monkeypatch.setattr(module, "apply_each", apart)
+    for module in (gru, networks):
+        monkeypatch.setattr(module, "then", one_by_one)
+
+
 @pytest.mark.parametrize("algo", ["sqn", "r2d2", "dqn"])
 @pytest.mark.parametrize("burn_in_length", [0, 3])
 def test_operations_of_an_update_are_those_of_the_traced_program(
     algo: Any, burn_in_length: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the network as it is written: layer by layer, even where two become one."""
-    for module in (gru, networks):
-        monkeypatch.setattr(module, "then", one_by_one)
+    as_written(monkeypatch)
     config = dataclasses.replace(LEARNER, burn_in_length=burn_in_length)
     rng = np.random.default_rng(6)
     episodes, weights = random_batch(rng)

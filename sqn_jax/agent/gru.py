@@ -6,9 +6,9 @@ Same equations as `flax.linen.GRUCell` (Cho et al. 2014, reset gate after the pr
     n = tanh(W_n x + b_n + r * (U_n h + c)),   h' = (1 - z) n + z h
 
 Only U h depends on the step before. The input half is one matrix product over all steps, and the
-backward pass leaves just one small product a step in its loop: the gradient of U is gathered
-afterwards in a single large product. Automatic differentiation would add up a [128, 384] matrix
-400 times instead.
+backward pass leaves just one small product a step in its loop: the gradients of W and U are
+gathered afterwards in a single large product each, from arrays with the three gates side by side.
+Automatic differentiation would add up a [128, 384] matrix 400 times instead.
 
 On an NVIDIA GPU the loops are two kernels (`gru_kernel`).
 """
@@ -47,9 +47,8 @@ class GRU(nn.Module):
         input_bias = self.param("input_bias", nn.initializers.zeros, (3 * size,))
         hidden_kernel = self.param("hidden_kernel", _orthogonal_gates, (size, 3 * size))
         candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (size,))
-        gates = zip(split_gates(input_kernel), split_gates(input_bias), strict=True)
-        reset, update, candidate = then(inputs, [Linear(*gate) for gate in gates])
-        hidden = scan_gates((reset, update, candidate), carry, hidden_kernel, candidate_bias)
+        projected = then(inputs, Linear(input_kernel, input_bias))
+        hidden = scan_gru(projected, carry, hidden_kernel, candidate_bias)
         return hidden[-1], hidden
 
 
@@ -77,41 +76,30 @@ def _orthogonal(key: Array, size: int) -> Array:
     return jax.lax.fori_loop(0, size, add_column, jnp.zeros((size, size)))
 
 
-def scan_gru(projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array) -> Array:
-    """Hidden states [T, B, H] from projected inputs [T, B, 3 H] in the gate order r, z, n.
-
-    `carry` is [B, H], `hidden_kernel` [H, 3 H], `candidate_bias` [H].
-    """
-    return scan_gates(split_gates(projected), carry, hidden_kernel, candidate_bias)
-
-
 Gates = tuple[Array, Array, Array]
 """One array for each gate: r, z, n."""
 
 
 def split_gates(array: Array) -> Gates:
-    """Split [..., 3 H] into the three gates.
-
-    From the inputs on, the gates stay apart: XLA's CPU code for a slice of a [B, 3 H] array, fused
-    with what follows in a loop, is scalar, and outside of one a copy of tens of megabytes.
-    """
+    """Split [..., 3 H] into the three gates."""
     reset, update, candidate = jnp.split(array, 3, axis=-1)
     return reset, update, candidate
 
 
 @jax.custom_vjp
-def scan_gates(
-    projected: Gates, carry: Array, hidden_kernel: Array, candidate_bias: Array
-) -> Array:
-    """`scan_gru` with the projected inputs of each gate on their own, [T, B, H] each."""
+def scan_gru(projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array) -> Array:
+    """Hidden states [T, B, H] from projected inputs [T, B, 3 H] in the gate order r, z, n.
+
+    `carry` is [B, H], `hidden_kernel` [H, 3 H], `candidate_bias` [H].
+    """
     return _forward(projected, carry, hidden_kernel, candidate_bias)[0]
 
 
 def _forward(
-    projected: Gates, carry: Array, hidden_kernel: Array, candidate_bias: Array
+    projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array
 ) -> tuple[Array, tuple[Array, ...]]:
     given = (projected, carry, split_gates(hidden_kernel), candidate_bias)
-    if gru_kernel.fits(len(projected[0]), carry.shape[-1]):
+    if gru_kernel.fits(len(projected), carry.shape[-1]):
         told = jax.lax.platform_dependent(*given, cuda=gru_kernel.forward, default=_scan_forward)
     else:
         told = _scan_forward(*given)
@@ -120,14 +108,18 @@ def _forward(
 
 
 def _scan_forward(
-    projected: Gates, carry: Array, kernels: Gates, candidate_bias: Array
+    projected: Array, carry: Array, kernels: Gates, candidate_bias: Array
 ) -> tuple[Array, ...]:
     """Hidden state, r, z, n and U_n h + c of each step, [T, B, H] each."""
     reset_kernel, update_kernel, candidate_kernel = kernels
     bias = jnp.expand_dims(candidate_bias, 0)
 
-    def advance(hidden: Array, inputs: Gates) -> tuple[Array, tuple[Array, ...]]:
-        to_reset, to_update, to_candidate = inputs
+    def advance(hidden: Array, step: Array) -> tuple[Array, tuple[Array, ...]]:
+        # Read gate by gate: XLA's CPU code for a slice of a [B, 3 H] array is scalar.
+        to_reset, to_update, to_candidate = (
+            jax.lax.dynamic_slice(projected, (step, 0, place), (1, *hidden.shape))[0]
+            for place in _places(hidden)
+        )
         recurrent = hidden @ candidate_kernel + bias
         reset = jax.nn.sigmoid(to_reset + hidden @ reset_kernel)
         update = jax.nn.sigmoid(to_update + hidden @ update_kernel)
@@ -135,13 +127,19 @@ def _scan_forward(
         new_hidden = (1 - update) * candidate + update * hidden
         return new_hidden, (new_hidden, reset, update, candidate, recurrent)
 
-    told: tuple[Array, ...] = jax.lax.scan(advance, carry, projected)[1]
+    told: tuple[Array, ...] = jax.lax.scan(advance, carry, jnp.arange(len(projected)))[1]
     return told
+
+
+def _places(hidden: Array) -> tuple[int, int, int]:
+    """Where in an array with the gates side by side each of them starts."""
+    size = hidden.shape[-1]
+    return 0, size, 2 * size
 
 
 def _backward(
     saved: tuple[Array, ...], hidden_gradient: Array
-) -> tuple[Gates, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     hidden, carry, hidden_kernel, *gates = saved
     previous = jnp.concatenate([carry[None], hidden[:-1]])
     given = (hidden_gradient, previous, tuple(gates), split_gates(hidden_kernel))
@@ -150,36 +148,50 @@ def _backward(
     else:
         told = _scan_backward(*given)
     carry_gradient, to_projected, to_recurrent = told
-    before = previous.reshape(-1, carry.shape[-1]).T
-    to_hidden = [x.reshape(-1, x.shape[-1]) for x in (*to_projected[:2], to_recurrent)]
-    kernel_gradient = jnp.concatenate([before @ rows for rows in to_hidden], axis=-1)
-    return to_projected, carry_gradient, kernel_gradient, sum_rows(to_hidden[2])
+    size = carry.shape[-1]
+    rows = to_recurrent.reshape(-1, 3 * size)
+    kernel_gradient = previous.reshape(-1, size).T @ rows
+    return to_projected, carry_gradient, kernel_gradient, sum_rows(rows)[2 * size :]
 
 
 def _scan_backward(
     hidden_gradient: Array, previous: Array, gates: tuple[Array, ...], kernels: Gates
-) -> tuple[Array, Gates, Array]:
-    """Gradients of the carry [B, H], of the projected inputs and of U_n h + c, [T, B, H]."""
+) -> tuple[Array, Array, Array]:
+    """Gradients of the carry [B, H], and of W x + b and U h + (0, 0, c), [T, B, 3 H] each."""
     from_reset, from_update, from_candidate = (kernel.T for kernel in kernels)
+    num_steps, *shape = previous.shape
+    rows = jnp.zeros((num_steps, shape[0], 3 * shape[1]), previous.dtype)
 
-    def retreat(later: Array, step: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        gradient, before, reset, update, candidate, recurrent = step
+    def retreat(
+        held: tuple[Array, Array, Array], given: tuple[Array, ...]
+    ) -> tuple[tuple[Array, Array, Array], None]:
+        later, to_projected, to_recurrent = held
+        step, gradient, before, reset, update, candidate, recurrent = given
         total = gradient + later
         to_candidate = total * (1 - update) * (1 - candidate * candidate)
         to_update = total * (before - candidate) * update * (1 - update)
         to_reset = to_candidate * recurrent * reset * (1 - reset)
-        to_recurrent = to_candidate * reset
-        to_before = to_reset @ from_reset + to_update @ from_update + to_recurrent @ from_candidate
-        return total * update + to_before, (to_reset, to_update, to_candidate, to_recurrent)
+        to_inner = to_candidate * reset
+        to_before = to_reset @ from_reset + to_update @ from_update + to_inner @ from_candidate
+        # Written gate by gate, as they are read: a concatenation first would be scalar, too.
+        for place, *values in zip(
+            _places(later),
+            (to_reset, to_update, to_candidate),
+            (to_reset, to_update, to_inner),
+            strict=True,
+        ):
+            start = (step, 0, place)
+            to_projected = jax.lax.dynamic_update_slice(to_projected, values[0][None], start)
+            to_recurrent = jax.lax.dynamic_update_slice(to_recurrent, values[1][None], start)
+        return (total * update + to_before, to_projected, to_recurrent), None
 
-    carry_gradient, (*to_projected, to_recurrent) = jax.lax.scan(
+    told: tuple[Array, Array, Array] = jax.lax.scan(
         retreat,
-        jnp.zeros_like(hidden_gradient[0]),
-        (hidden_gradient, previous, *gates),
+        (jnp.zeros_like(hidden_gradient[0]), rows, rows),
+        (jnp.arange(num_steps), hidden_gradient, previous, *gates),
         reverse=True,
-    )
-    to_reset, to_update, to_candidate = to_projected
-    return carry_gradient, (to_reset, to_update, to_candidate), to_recurrent
+    )[0]
+    return told
 
 
-scan_gates.defvjp(_forward, _backward)
+scan_gru.defvjp(_forward, _backward)

@@ -58,12 +58,12 @@ def _compute_capability() -> str | None:
 
 
 def forward(
-    projected: Gates, carry: Array, kernels: Gates, bias: Array, *, interpret: bool = False
+    projected: Array, carry: Array, kernels: Gates, bias: Array, *, interpret: bool = False
 ) -> tuple[Array, ...]:
     """Hidden states and what the way back needs.
 
     Args:
-        projected: the input half of gates r, z, n, [T, B, H] each.
+        projected: the input half of gates r, z, n side by side, [T, B, 3 H].
         carry: [B, H].
         kernels: the recurrent matrices of the gates, [H, H] each.
         bias: [H] of the candidate's recurrent half.
@@ -72,9 +72,9 @@ def forward(
     Returns:
         Hidden state, r, z, n, and the candidate's recurrent half U_n h + c, [T, B, H] each.
     """
-    num_steps, batch, size = projected[0].shape
+    num_steps, (batch, size) = len(projected), carry.shape
     sequence, state, matrix, vector = _blocks(num_steps, size)
-    filled = [_fill(x, axis=1) for x in projected]
+    filled = [_fill(x, axis=1) for x in jnp.split(projected, 3, axis=-1)]
     call = pl.pallas_call(
         partial(_forward_body, num_steps=num_steps),
         out_shape=[jax.ShapeDtypeStruct(filled[0].shape, carry.dtype)] * 5,
@@ -91,7 +91,7 @@ def forward(
 
 def backward(
     hidden_gradient: Array, previous: Array, gates: Any, kernels: Gates, *, interpret: bool = False
-) -> tuple[Array, Gates, Array]:
+) -> tuple[Array, Array, Array]:
     """Gradients of what goes into each step.
 
     Args:
@@ -102,8 +102,8 @@ def backward(
         interpret: as in `forward`.
 
     Returns:
-        Gradients of the carry [B, H], of the projected inputs, and of the candidate's recurrent
-        half [T, B, H].
+        Gradients of the carry [B, H], and of both halves of the gates, the projected inputs and the
+        recurrent half, [T, B, 3 H] each.
     """
     num_steps, batch, size = previous.shape
     sequence, state, matrix, _ = _blocks(num_steps, size)
@@ -122,7 +122,9 @@ def backward(
     )
     to_carry, *told = call(*filled, *(x.T for x in kernels))
     to_reset, to_update, to_candidate, to_recurrent = (x[:, :batch] for x in told)
-    return to_carry[:batch], (to_reset, to_update, to_candidate), to_recurrent
+    halves = ((to_reset, to_update, to_candidate), (to_reset, to_update, to_recurrent))
+    to_projected, to_hidden = (jnp.concatenate(half, axis=-1) for half in halves)
+    return to_carry[:batch], to_projected, to_hidden
 
 
 def _fill(array: Array, axis: int) -> Array:

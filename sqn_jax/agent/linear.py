@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
@@ -54,11 +53,34 @@ class Linear(NamedTuple):
     bias: Array
 
 
+def stacked(layers: Sequence[Linear]) -> Linear:
+    """One layer [D, E_1 + E_2 + ...] that does what several do with the same inputs.
+
+    One product packs the inputs once, and so does that for the gradients of all kernels.
+    """
+    if len(layers) == 1:
+        return layers[0]
+    kernel = jnp.concatenate([layer.kernel for layer in layers], axis=1)
+    return Linear(kernel, jnp.concatenate([layer.bias for layer in layers]))
+
+
+def apply_each(inputs: Array, layers: Sequence[Linear]) -> Array:
+    """Several layers [D_i, E_i], each on inputs of its own: [..., D_1 + ...] to [..., E_1 + ...].
+
+    As one product with zeros off the diagonal. Of layers with few inputs or few outputs that takes
+    less time than taking their inputs apart.
+    """
+    if len(layers) == 1:
+        return affine(inputs, *layers[0])
+    kernel = jax.scipy.linalg.block_diag(*(layer.kernel for layer in layers))
+    return affine(inputs, kernel, jnp.concatenate([layer.bias for layer in layers]))
+
+
 class Branches(NamedTuple):
     """Linear layers side by side, not applied yet: what follows may make it unnecessary."""
 
-    inputs: tuple[Array, ...]
-    """[..., D_i] what each layer is given."""
+    inputs: Array
+    """[..., D_1 + D_2 + ...] what the layers are given."""
     layers: tuple[Linear, ...]
     """Kernels [D_i, E_i]."""
 
@@ -69,37 +91,17 @@ class Branches(NamedTuple):
 
     def outputs(self) -> Array:
         """What the layers make of their inputs, side by side: [..., E]."""
-        pairs = zip(self.inputs, self.layers, strict=True)
-        outputs = [affine(inputs, *layer) for inputs, layer in pairs]
-        return outputs[0] if len(outputs) == 1 else jnp.concatenate(outputs, axis=-1)
+        return apply_each(self.inputs, self.layers)
 
 
-def then(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
-    """The outputs of `branches` through each of further linear layers, [..., F_j] each.
+def then(branches: Branches, following: Linear) -> Array:
+    """The outputs of `branches` through a further linear layer [E, F]: [..., F].
 
-    Two linear layers in a row, (x A + a) B + b, are one, x (A B) + (a B + b). Of many rows x that
-    takes fewer multiplications, and A's output need not be written and read; of few it takes more.
-    The order is chosen by their number.
-
-    Args:
-        branches: with E outputs in all.
-        following: kernels [E, F_j].
+    Two linear layers in a row, (x A + a) B + b, are one, x (A B) + (a B + b): fewer multiplications
+    for many rows x, and A's output need not be written and read. In a loop with few rows a turn the
+    compiler multiplies A and B once, before the loop.
     """
-    rows = math.prod(branches.inputs[0].shape[:-1])
-    ahead = sum(layer.bias.size for layer in following)
-    given = sum(layer.kernel.shape[0] for layer in branches.layers)
-    apart = rows * sum(layer.kernel.size for layer in (*branches.layers, *following))
-    at_once = ahead * (rows * given + sum(layer.kernel.size for layer in branches.layers))
-    if apart <= at_once:
-        return one_by_one(branches, following)
-    inputs = jnp.concatenate(branches.inputs, axis=-1)
-    return tuple(affine(inputs, *_composed(branches.layers, layer)) for layer in following)
-
-
-def one_by_one(branches: Branches, following: Sequence[Linear]) -> tuple[Array, ...]:
-    """What `then` returns, layer by layer, as a network is written."""
-    outputs = branches.outputs()
-    return tuple(affine(outputs, *layer) for layer in following)
+    return affine(branches.inputs, *_composed(branches.layers, following))
 
 
 def _composed(first: Sequence[Linear], second: Linear) -> Linear:

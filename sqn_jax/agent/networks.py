@@ -6,8 +6,8 @@ the rollout know only this interface; which network runs is a matter of configur
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, cast
 
 import flax.linen as nn
 import jax
@@ -16,7 +16,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.gru import GRU
-from sqn_jax.agent.linear import Branches, Linear, affine, then
+from sqn_jax.agent.linear import Branches, Linear, affine, apply_each, stacked, then
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -52,8 +52,26 @@ class QOutput:
     """[T, B, K, A] action values of each skill (eq. 5)."""
 
 
+class Norm(NamedTuple):
+    """Scale and bias [H] after a layer normalisation."""
+
+    scale: Array
+    bias: Array
+
+
+class TwoLayers(NamedTuple):
+    """The parameters of an MLP with one hidden layer."""
+
+    hidden: Linear
+    norm: Norm | None
+    output: Linear
+
+
 class MLP(nn.Module):
-    """Two linear layers with a ReLU in between, optionally layer-normalised before it."""
+    """Two linear layers with a ReLU in between, optionally layer-normalised before it.
+
+    Only their parameters: what is computed side by side is one product (`side_by_side`).
+    """
 
     hidden_size: int
     output_size: int
@@ -64,14 +82,30 @@ class MLP(nn.Module):
     """Scale of the first layer's initial weights and biases."""
 
     @nn.compact
-    def __call__(self, inputs: Array) -> Branches:
-        """Map [..., D] to [..., output_size], all but the output layer done."""
-        layer = _linear(inputs.shape[-1], self.hidden_size, "hidden", self.input_scale)
-        hidden = affine(inputs, *layer)
-        if self.layer_norm:
-            hidden = _layer_norm("norm")(hidden)
+    def __call__(self, fan_in: int) -> TwoLayers:
+        """The layers for inputs [..., fan_in]."""
+        hidden = _linear(fan_in, self.hidden_size, "hidden", self.input_scale)
+        norm = _Norm(self.hidden_size, name="norm")() if self.layer_norm else None
         output = _linear(self.hidden_size, self.output_size, "output", self.output_scale)
-        return Branches((nn.relu(hidden),), (output,))
+        return TwoLayers(hidden, norm, output)
+
+
+def side_by_side(inputs: Array, mlps: Sequence[TwoLayers]) -> Branches:
+    """Several MLPs with the same inputs [..., D], all but their output layers done."""
+    hidden = affine(inputs, *stacked([mlp.hidden for mlp in mlps]))
+    norms = [mlp.norm for mlp in mlps if mlp.norm is not None]
+    if norms:
+        hidden = _normalise(hidden, norms)
+    return Branches(nn.relu(hidden), tuple(mlp.output for mlp in mlps))
+
+
+def _normalise(hidden: Array, norms: Sequence[Norm]) -> Array:
+    """Layer normalisation of each of several layers of equal size side by side, [..., n H]."""
+    groups = hidden.reshape(*hidden.shape[:-1], len(norms), -1)
+    normal = cast(Array, nn.LayerNorm(use_scale=False, use_bias=False).apply({}, groups))
+    shape = (1,) * (hidden.ndim - 1) + groups.shape[-2:]
+    scale, bias = (jnp.stack(each).reshape(shape) for each in zip(*norms, strict=True))
+    return (normal * scale + bias).reshape(hidden.shape)
 
 
 class Features(nn.Module):
@@ -84,9 +118,13 @@ class Features(nn.Module):
         """Map an observation [T, B, ...] to features [T, B, 2 H]."""
         size = self.config.hidden_size
         # Never normalised: over two inputs it would keep their ratio and lose their size.
-        ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges)
-        goal = MLP(size, size, layer_norm=False, input_scale=GOAL_SCALE, name="goal")(obs.goal)
-        return Branches(ranges.inputs + goal.inputs, ranges.layers + goal.layers)
+        ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges.shape[-1])
+        goal = MLP(size, size, layer_norm=False, input_scale=GOAL_SCALE, name="goal")(
+            obs.goal.shape[-1]
+        )
+        inputs = jnp.concatenate([obs.ranges, obs.goal], axis=-1)
+        hidden = apply_each(inputs, [ranges.hidden, goal.hidden])
+        return Branches(nn.relu(hidden), (ranges.output, goal.output))
 
 
 class SkillQNetwork(nn.Module):
@@ -102,26 +140,30 @@ class SkillQNetwork(nn.Module):
         size, norm = config.hidden_size, config.layer_norm
         features = Features(config, name="features")(obs)
         carry, perception = GRU(size, name="perception")(features, carry)
-        decision = MLP(size, config.num_skills, norm, HEAD_SCALE, name="decision")(
-            perception + self._embedding("decision_embedding")
-        )
-        skill_weights = nn.softmax(decision.outputs(), axis=-1)
-        skill_q_values = jnp.stack(
-            [
-                MLP(size, self.num_actions, norm, HEAD_SCALE, name=f"skill_{index}")(
-                    perception + self._embedding(f"skill_{index}_embedding")
-                ).outputs()
-                for index in range(config.num_skills)
-            ],
-            axis=-2,
+        heads = [("decision", config.num_skills)]
+        heads += [(f"skill_{index}", self.num_actions) for index in range(config.num_skills)]
+        mlps = []
+        for name, outputs in heads:
+            mlp = MLP(size, outputs, norm, HEAD_SCALE, name=name)(size)
+            mlps.append(mlp._replace(hidden=_shifted(mlp.hidden, self._embedding(name))))
+        told = side_by_side(perception, mlps).outputs()
+        skill_weights = nn.softmax(told[..., : config.num_skills], axis=-1)
+        skill_q_values = told[..., config.num_skills :].reshape(
+            *told.shape[:-1], config.num_skills, self.num_actions
         )
         q_values = (skill_weights[..., None] * skill_q_values).sum(axis=-2)
         return carry, QOutput(q_values, skill_weights, skill_q_values)
 
     def _embedding(self, name: str) -> Array:
-        """A learnable module embedding [1, 1, H]; small at first, so that it does not drown z."""
-        size = self.config.hidden_size
-        return self.param(name, nn.initializers.normal(0.02), (size,))[None, None]
+        """A head's learnable module embedding [H]; small at first, so that it does not drown z."""
+        shape = (self.config.hidden_size,)
+        embedding: Array = self.param(f"{name}_embedding", nn.initializers.normal(0.02), shape)
+        return embedding
+
+
+def _shifted(layer: Linear, embedding: Array) -> Linear:
+    """The layer [D, E] that makes of z what `layer` makes of z + embedding, [D]."""
+    return Linear(layer.kernel, layer.bias + embedding @ layer.kernel)
 
 
 class RecurrentQNetwork(nn.Module):
@@ -136,8 +178,8 @@ class RecurrentQNetwork(nn.Module):
         size, norm = self.config.hidden_size, self.config.layer_norm
         features = Features(self.config, name="features")(obs)
         carry, perception = GRU(size, name="perception")(features, carry)
-        head = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(perception)
-        return carry, _single_head(head.outputs())
+        head = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(size)
+        return carry, _single_head(side_by_side(perception, [head]).outputs())
 
 
 class FeedForwardQNetwork(nn.Module):
@@ -151,11 +193,11 @@ class FeedForwardQNetwork(nn.Module):
         """Return the carry unchanged and the Q-values for observations [T, B, ...]."""
         width = self.config.hidden_size * self.config.dqn_width_factor
         features = Features(self.config, name="features")(obs)
-        (hidden,) = then(features, [_linear(features.size, width, "perception")])
+        hidden = then(features, _linear(features.size, width, "perception"))
         if self.config.layer_norm:
-            hidden = _layer_norm("norm")(hidden)
+            hidden = _normalise(hidden, [_Norm(width, name="norm")()])
         head = MLP(width, self.num_actions, self.config.layer_norm, HEAD_SCALE, name="skill_0")
-        return carry, _single_head(head(nn.relu(hidden)).outputs())
+        return carry, _single_head(side_by_side(nn.relu(hidden), [head(width)]).outputs())
 
 
 QNetwork = SkillQNetwork | RecurrentQNetwork | FeedForwardQNetwork
@@ -214,5 +256,13 @@ def _linear(fan_in: int, size: int, name: str, scale: float = 1.0) -> Linear:
     return layer
 
 
-def _layer_norm(name: str) -> nn.LayerNorm:
-    return nn.LayerNorm(name=name)
+class _Norm(nn.Module):
+    """The parameters after a layer normalisation."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self) -> Norm:
+        shape = (self.size,)
+        scale = self.param("scale", nn.initializers.ones, shape)
+        return Norm(scale, self.param("bias", nn.initializers.zeros, shape))

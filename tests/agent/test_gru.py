@@ -50,7 +50,7 @@ def numpy_scan(projected, carry, hidden_kernel, bias):
 def as_given(inputs: Array) -> Branches:
     """Inputs as they are, through a layer that changes nothing."""
     size = inputs.shape[-1]
-    return Branches((inputs,), (Linear(jnp.eye(size), jnp.zeros(size)),))
+    return Branches(inputs, (Linear(jnp.eye(size), jnp.zeros(size)),))
 
 
 def test_it_equals_the_flax_cell_with_the_same_weights() -> None:

@@ -13,10 +13,10 @@ from sqn_jax.agent import gru, gru_kernel
 STEPS, SIZE = 11, 16
 
 
-def random_problem(batch: int) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array, jax.Array]:
-    """Projected inputs of three gates, carry, hidden kernel [H, 3 H] and bias."""
+def random_problem(batch: int) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Projected inputs [T, B, 3 H], carry, hidden kernel [H, 3 H] and bias."""
     rng = np.random.default_rng(batch)
-    projected = tuple(rng.normal(size=(STEPS, batch, SIZE)) for _ in range(3))
+    projected = rng.normal(size=(STEPS, batch, 3 * SIZE))
     carry = rng.uniform(-1, 1, size=(batch, SIZE))
     kernel = rng.normal(size=(SIZE, 3 * SIZE)) / SIZE**0.5
     bias = rng.normal(size=SIZE)
@@ -34,12 +34,11 @@ def test_forward_is_the_gru_to_ten_bits(batch: int) -> None:
     projected, carry, kernel, bias = random_problem(batch)
     told = forward(projected, carry, kernel, bias)
     assert [x.shape for x in told] == [(STEPS, batch, SIZE)] * 5
-    joined = np.concatenate([np.asarray(x) for x in projected], axis=-1)
     state = np.asarray(carry)
     for step in range(STEPS):
         rows = range(batch)
         state = np.stack(
-            [projected_gru_step(joined[step, b], state[b], kernel, bias) for b in rows]
+            [projected_gru_step(projected[step, b], state[b], kernel, bias) for b in rows]
         )
         np.testing.assert_allclose(told[0][step], state, atol=2e-3)
 
@@ -106,9 +105,9 @@ def test_the_gru_asks_for_the_kernel_on_a_gpu_only(monkeypatch: pytest.MonkeyPat
     arguments = random_problem(16)
     calls = []
     monkeypatch.setattr(gru_kernel, "forward", lambda *given: calls.append(1) or _scan(*given))
-    told = jax.jit(gru.scan_gates)(*arguments)
+    told = jax.jit(gru.scan_gru)(*arguments)
     monkeypatch.setattr(gru_kernel, "_compute_capability", lambda: None)
-    np.testing.assert_array_equal(told, gru.scan_gates(*arguments))
+    np.testing.assert_array_equal(told, gru.scan_gru(*arguments))
     assert calls == [1]
 
 

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
 
-from sqn_jax.agent.linear import Branches, Linear, affine, sum_rows, then
+from sqn_jax.agent.linear import (
+    Branches,
+    Linear,
+    affine,
+    apply_each,
+    stacked,
+    sum_rows,
+    then,
+)
 
 
 def arrays(*leading: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,65 +69,99 @@ def test_rows_are_summed() -> None:
 
 SIZES = ((5, 4), (3, 6))
 """D_i and E_i of two layers side by side."""
-FOLLOWING = (7, 2)
-"""F_j of two layers that follow both."""
+AFTER = 7
+"""F of a layer that follows both."""
 FEW, MANY = 2, 400
 
 
-def two_after_two(rows: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Random inputs of two layers and the kernels and biases of all four layers."""
+def random_layers(rng: np.random.Generator, sizes: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(rng.normal(size=(given, made)), rng.normal(size=made)) for given, made in sizes]
+
+
+def as_linear(layers: Any) -> list[Linear]:
+    return [Linear(*(jnp.asarray(x, jnp.float32) for x in layer)) for layer in layers]
+
+
+def test_stacked_layers_do_what_each_does_with_the_same_inputs() -> None:
+    rng = np.random.default_rng(1)
+    layers = random_layers(rng, [(5, 4), (5, 1), (5, 3)])
+    inputs = rng.normal(size=(2, 5))
+    got = affine(jnp.asarray(inputs, jnp.float32), *stacked(as_linear(layers)))
+    expected = [inputs @ kernel + bias for kernel, bias in layers]
+    np.testing.assert_allclose(got, np.concatenate(expected, axis=1), atol=1e-5)
+
+
+def test_layers_with_inputs_of_their_own_see_nothing_of_each_other_s() -> None:
+    rng = np.random.default_rng(2)
+    layers = random_layers(rng, [(5, 4), (3, 1), (2, 6)])
+    inputs = [rng.normal(size=(2, given)) for given in (5, 3, 2)]
+    joined = jnp.asarray(np.concatenate(inputs, axis=1), jnp.float32)
+    got = apply_each(joined, as_linear(layers))
+    expected = [x @ kernel + bias for x, (kernel, bias) in zip(inputs, layers, strict=True)]
+    np.testing.assert_allclose(got, np.concatenate(expected, axis=1), atol=1e-5)
+
+
+def two_then_one(rows: int) -> tuple[list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
+    """Random inputs of two layers, and the kernels and biases of all three layers."""
     rng = np.random.default_rng(rows)
     inputs = [rng.normal(size=(2, rows // 2, given)) for given, _ in SIZES]
-    shapes = [*SIZES, *((4 + 6, made) for made in FOLLOWING)]
-    layers = [rng.normal(size=shape) for given, made in shapes for shape in ((given, made), made)]
-    return inputs, layers
+    return inputs, random_layers(rng, [*SIZES, (4 + 6, AFTER)])
 
 
-def two_in_a_row(inputs: list[Array], layers: list[Array]) -> tuple[Array, ...]:
-    singles = [jnp.asarray(x, jnp.float32) for x in layers]
-    first, second, *following = (
-        Linear(*pair) for pair in zip(singles[::2], singles[1::2], strict=True)
-    )
-    given = tuple(jnp.asarray(x, jnp.float32) for x in inputs)
-    return then(Branches(given, (first, second)), following)
+def in_a_row(inputs: Sequence[Any], layers: list[Linear]) -> Array:
+    first, second, following = layers
+    joined = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in inputs], axis=-1)
+    return then(Branches(joined, (first, second)), following)
 
 
-@pytest.mark.parametrize("rows", [FEW, MANY])
-def test_layers_in_a_row_are_one_after_the_other_whatever_the_order(rows: int) -> None:
-    inputs, layers = two_after_two(rows)
-    outputs = [x @ layers[2 * i] + layers[2 * i + 1] for i, x in enumerate(inputs)]
-    features = np.concatenate(outputs, axis=-1)
-    for index, got in enumerate(two_in_a_row(inputs, layers)):
-        expected = features @ layers[4 + 2 * index] + layers[5 + 2 * index]
-        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
+def test_layers_in_a_row_are_one_after_the_other() -> None:
+    inputs, layers = two_then_one(MANY)
+    outputs = [x @ kernel + bias for x, (kernel, bias) in zip(inputs, layers, strict=False)]
+    kernel, bias = layers[2]
+    expected = np.concatenate(outputs, axis=-1) @ kernel + bias
+    got = in_a_row(inputs, as_linear(layers))
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("rows", [FEW, MANY])
-def test_layers_in_a_row_have_the_derivatives_of_the_product_written_out(rows: int) -> None:
-    inputs, layers = two_after_two(rows)
+def test_layers_in_a_row_have_the_derivatives_of_the_product_written_out() -> None:
+    inputs, layers = two_then_one(MANY)
 
-    def written_out(layers: list[Array]) -> Array:
+    def written_out(layers: list[Linear]) -> Array:
         outputs = [
-            jnp.asarray(x, jnp.float32) @ layers[2 * i] + layers[2 * i + 1][None, None]
-            for i, x in enumerate(inputs)
+            jnp.asarray(x, jnp.float32) @ kernel + bias[None, None]
+            for x, (kernel, bias) in zip(inputs, layers, strict=False)
         ]
-        features = jnp.concatenate(outputs, axis=-1)
-        told = [features @ layers[i] + layers[i + 1][None, None] for i in (4, 6)]
-        return sum((jnp.sin(x).sum() for x in told), jnp.float32(0))
+        kernel, bias = layers[2]
+        return jnp.sin(jnp.concatenate(outputs, axis=-1) @ kernel + bias[None, None]).sum()
 
-    def ours(layers: list[Array]) -> Array:
-        return sum((jnp.sin(x).sum() for x in two_in_a_row(inputs, layers)), jnp.float32(0))
+    def ours(layers: list[Linear]) -> Array:
+        return jnp.sin(in_a_row(inputs, layers)).sum()
 
-    singles = [jnp.asarray(x, jnp.float32) for x in layers]
-    for got, expected in zip(jax.grad(ours)(singles), jax.grad(written_out)(singles), strict=True):
+    found = [jax.tree.leaves(jax.grad(f)(as_linear(layers))) for f in (ours, written_out)]
+    for got, expected in zip(*found, strict=True):
         np.testing.assert_allclose(got, expected, rtol=2e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("rows", [FEW, MANY])
-def test_layers_in_a_row_take_the_order_with_fewer_multiplications(rows: int) -> None:
+def test_many_rows_through_layers_in_a_row_take_the_multiplications_of_one_layer() -> None:
     """By XLA's own count, which also has the few additions."""
-    counted = jax.jit(two_in_a_row).lower(*two_after_two(rows)).compile().cost_analysis()["flops"]
-    layer_by_layer = 2 * rows * (5 * 4 + 3 * 6 + 10 * (7 + 2))
-    layers_first = 2 * (rows * (5 + 3) * (7 + 2) + (5 * 4 + 3 * 6) * (7 + 2))
-    fewer, more = sorted((layer_by_layer, layers_first))
-    assert fewer <= counted < 1.35 * fewer < 0.8 * more
+    inputs, layers = two_then_one(MANY)
+    compiled = jax.jit(lambda layers: in_a_row(inputs, layers)).lower(as_linear(layers)).compile()
+    one_layer = 2 * MANY * (5 + 3) * AFTER
+    both_kernels = 2 * (5 * 4 + 3 * 6) * AFTER
+    assert one_layer <= compiled.cost_analysis()["flops"] < 1.35 * (one_layer + both_kernels)
+
+
+def test_few_rows_in_a_loop_do_not_multiply_the_layers_again_and_again() -> None:
+    """What XLA's loop is given is the one layer, [8, 7], not the last of the two, [10, 7]."""
+    inputs, layers = two_then_one(FEW)
+
+    def turns(layers: list[Linear]) -> Array:
+        def turn(total: Array, _: None) -> tuple[Array, None]:
+            return in_a_row([x + total for x in inputs], layers).sum(), None
+
+        return jax.lax.scan(turn, jnp.float32(0), None, length=9)[0]
+
+    text = jax.jit(turns).lower(as_linear(layers)).compile().as_text()
+    (held,) = re.findall(r" = \((.*)\) while\(", text)
+    assert "f32[8,7]" in held
+    assert "f32[10,7]" not in held
