@@ -295,7 +295,7 @@ def runner_specs(config: TrainConfig) -> RunnerState:
     return RunnerState(learner=whole, memory=memory, key=whole, round=whole)
 
 
-compiled_train_chunk = jax.jit(
+_jitted_train_chunk = jax.jit(
     train_chunk, static_argnames=("config", "mesh"), donate_argnames="runner"
 )
 
@@ -352,7 +352,7 @@ def compile_chunk(
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), mesh)
     runner = runner_shapes(env_params, config, mesh)
-    lowered = compiled_train_chunk.lower(runner, world, config, mesh)
+    lowered = _jitted_train_chunk.lower(runner, world, config, mesh)
     program = lowered.compile(compiler_options=compiler_options(config))
     return program, time.perf_counter() - started
 

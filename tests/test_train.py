@@ -87,13 +87,11 @@ def assert_same_bits(one: Any, other: Any) -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-def all_chunks(
-    runner: RunnerState, world: EnvParams, config: TrainConfig
-) -> tuple[RunnerState, list[Any]]:
-    """Train to the end with the jitted program; the final state and the metrics of all rounds."""
+def all_chunks(runner: RunnerState, run: Trained) -> tuple[RunnerState, list[Any]]:
+    """Train to the end with a run's program; the final state and the metrics of all rounds."""
     metrics = []
-    for _ in range(config.num_chunks):
-        runner, chunk = train.compiled_train_chunk(runner, world, config, None)
+    for _ in range(run.config.num_chunks):
+        runner, chunk = run.program(runner, run.world)
         metrics.append(jax.device_get(chunk))
     return runner, metrics
 
@@ -104,6 +102,7 @@ class Trained:
 
     config: TrainConfig
     world: EnvParams
+    program: train.ChunkProgram
     final: RunnerState
     metrics: list[Any]
     traces: list[int]
@@ -122,16 +121,17 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "train_round", counted)
+        program, _ = train.compile_chunk(world, config)
         runner, metrics, traces = train.start_run(world, config), [], []
         keys = [tuple(numbers(runner.key)[0].tolist())]
         for _ in range(config.num_chunks):
-            runner, chunk = train.compiled_train_chunk(runner, world, config, None)
+            runner, chunk = program(runner, world)
             metrics.append(jax.device_get(chunk))
             traces.append(count)
             keys.append(tuple(numbers(runner.key)[0].tolist()))
         for _ in train.run(train.start_run(world, config), world, config):
             traces.append(count)
-    return Trained(config, world, runner, metrics, traces, keys)
+    return Trained(config, world, program, runner, metrics, traces, keys)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def other_seed(smoke: Trained) -> tuple[RunnerState, list[Any]]:
     config = dataclasses.replace(smoke.config, seed=smoke.config.seed + 1)
     with compiling_quickly():
         runner = train.start_run(smoke.world, config)
-    return all_chunks(runner, smoke.world, smoke.config)
+    return all_chunks(runner, smoke)
 
 
 def test_the_program_is_traced_once(either: Trained) -> None:
@@ -173,7 +173,7 @@ def test_a_state_from_a_checkpoint_gets_the_program_of_a_new_one(smoke: Trained)
     and the one that the first start has compiled and kept would be of no use to the second."""
     bound = jax.device_put(smoke.world, jax.devices()[0])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.stages.Lowered, "compile", jax.stages.Lowered.as_text)
+        patch.setattr(jax.stages.Lowered, "compile", lambda lowered, **_: lowered.as_text())
         new, resumed = (
             train.compile_chunk(world, smoke.config)[0] for world in (smoke.world, bound)
         )
@@ -183,7 +183,7 @@ def test_a_state_from_a_checkpoint_gets_the_program_of_a_new_one(smoke: Trained)
 
 def test_the_same_seed_gives_the_same_numbers_bit_for_bit(either: Trained) -> None:
     runner = train.start_run(either.world, either.config)
-    final, metrics = all_chunks(runner, either.world, either.config)
+    final, metrics = all_chunks(runner, either)
     assert_same_bits(final, either.final)
     assert_same_bits(metrics, either.metrics)
 
@@ -231,7 +231,8 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
         ):
             np.testing.assert_allclose(one[index], other, atol=1e-5)
     with compiling_quickly():
-        _, metrics = train.compiled_train_chunk(runners, smoke.world, config, None)
+        program, _ = train.compile_chunk(smoke.world, config)
+        _, metrics = program(runners, smoke.world)
     for index, alone in enumerate((smoke.metrics[0], other_seed[1][0])):
         for name in METRICS:
             np.testing.assert_allclose(
@@ -241,7 +242,7 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
 
 def test_the_state_given_to_a_chunk_is_donated(either: Trained) -> None:
     runner = train.start_run(either.world, either.config)
-    new_runner, _ = train.compiled_train_chunk(runner, either.world, either.config, None)
+    new_runner, _ = either.program(runner, either.world)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(either.world))
