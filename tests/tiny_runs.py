@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from compiling import compiling_quickly
 from rooms import write_empty_room
@@ -72,9 +73,10 @@ class TinyRuns:
         )
 
     def call(self, run: str, *more: str, resume: bool = False) -> tuple[int, str, str]:
-        """Run to the end in this process: exit code, stdout, stderr."""
+        """Run to the end in this process, with the programs kept: exit code, stdout, stderr."""
         out, err = io.StringIO(), io.StringIO()
         with (
+            patch.dict(os.environ, SQN_JAX_CACHE=self.environment["SQN_JAX_CACHE"]),
             redirect_stdout(out),
             redirect_stderr(err),
             warnings.catch_warnings(),
