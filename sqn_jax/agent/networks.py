@@ -142,7 +142,7 @@ class SkillQNetwork(nn.Module):
         carry, perception = GRU(size, name="perception")(features, carry)
         heads = [("decision", config.num_skills)]
         heads += [(f"skill_{index}", self.num_actions) for index in range(config.num_skills)]
-        mlps = []
+        mlps = []  # Each sees the perception plus an embedding of its own.
         for name, outputs in heads:
             mlp = MLP(size, outputs, norm, HEAD_SCALE, name=name)(size)
             mlps.append(mlp._replace(hidden=_shifted(mlp.hidden, self._embedding(name))))
