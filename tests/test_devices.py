@@ -210,8 +210,15 @@ def test_whole_episodes_are_compiled_with_eigen_s_products_and_windows_as_usual(
 def test_where_xla_does_not_know_the_option_its_default_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert not devices._knows(("xla_cpu_of_another_version",))
+    assert devices._knows((("xla_cpu_enable_fast_math", False),))
+    assert not devices._knows((("xla_cpu_of_another_version", ""),))
     monkeypatch.setattr(devices, "_knows", lambda options: False)
+    assert devices.compiler_options(config_for("r2d2")) == {}
+
+
+def test_what_the_user_has_told_xla_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    (name,) = devices.compiler_options(config_for("r2d2"))
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_some=1 --{name}=LIBRARY_FUSION_TYPE_DOT")
     assert devices.compiler_options(config_for("r2d2")) == {}
 
 

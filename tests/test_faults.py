@@ -96,7 +96,7 @@ def test_a_run_killed_thirty_times_ends_in_the_same_bits(tmp_path: Path, method:
 def assert_stopped(runs: TinyRuns, run: str, number: int, code: int, err: str) -> None:
     assert code == 128 + number, err
     assert f"sqn: stopped by {signal.Signals(number).name}" in err
-    assert f"go on with `sqn train --run-dir {runs.folder / run} --resume`" in err
+    assert f"go on with `sqn train --run-dir {runs.folder / run} --resume --num-devices 1`" in err
     assert "Traceback" not in err
     assert not (runs.folder / run / "summary.json").exists()
 

@@ -6,11 +6,11 @@ Same equations as `flax.linen.GRUCell` (Cho et al. 2014, reset gate after the pr
     n = tanh(W_n x + b_n + r * (U_n h + c)),   h' = (1 - z) n + z h
 
 Only U h depends on the step before. The input half is one matrix product over all steps, and the
-backward pass leaves just one small product a step in its loop: the gradients of W and U are
-gathered afterwards in a single large product each, from arrays with the three gates side by side.
-Automatic differentiation would add up a [128, 384] matrix 400 times instead.
+backward pass leaves just the three small products of a step in its loop: the gradients of both
+halves' matrices are gathered afterwards in a single large product each, from arrays with the three
+gates side by side. Automatic differentiation would add up a [128, 384] matrix 400 times instead.
 
-On an NVIDIA GPU the loops are two kernels (`gru_kernel`).
+On an NVIDIA GPU that has the room the loops are two kernels (`gru_kernel`).
 """
 
 from __future__ import annotations

@@ -70,14 +70,14 @@ class TwoLayers(NamedTuple):
 class MLP(nn.Module):
     """Two linear layers with a ReLU in between, optionally layer-normalised before it.
 
-    Only their parameters: what is computed side by side is one product (`side_by_side`).
+    Only their parameters: heads are computed side by side (`side_by_side`), and so are features.
     """
 
     hidden_size: int
     output_size: int
     layer_norm: bool
     output_scale: float = 1.0
-    """Scale of the output layer's initial weights; small for a head, which then starts near 0."""
+    """Scale of the output layer's initial weights and biases: small for a head, near 0 at first."""
     input_scale: float = 1.0
     """Scale of the first layer's initial weights and biases."""
 
@@ -115,7 +115,7 @@ class Features(nn.Module):
 
     @nn.compact
     def __call__(self, obs: HasObservation) -> Branches:
-        """Map an observation [T, B, ...] to features [T, B, 2 H]."""
+        """Map an observation [T, B, ...] to features [T, B, 2 H], all but the last layers done."""
         size = self.config.hidden_size
         # Never normalised: over two inputs it would keep their ratio and lose their size.
         ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges.shape[-1])

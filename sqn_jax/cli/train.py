@@ -117,6 +117,9 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
     devices.require(own.device)
     config = _with_absolute_paths(config)
     command = f"sqn train --run-dir {shlex.quote(str(run_dir))} --resume"
+    for name in ("device", "num_devices"):  # On others it would not be the same to the bit.
+        value = getattr(own, name)
+        command += "" if value is None else f" --{name.replace('_', '-')} {value}"
     with last_words(f"go on with `{command}`"):
         train_session(
             config,
