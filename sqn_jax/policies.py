@@ -96,7 +96,8 @@ def require_same_network(policy: Policy, config: TrainConfig) -> None:
     for name in decisive:
         if theirs[name] != ours[name]:
             raise ValueError(
-                f"start_from {policy.name}: its {name} is {theirs[name]}, here it is {ours[name]}"
+                f"--start-from {config.start_from}: its {name} is {theirs[name]}, here it is "
+                f"{ours[name]} (--{name.replace('_', '-')})"
             )
 
 

@@ -56,7 +56,10 @@ def test_it_learns_on_from_there(runs: TinyRuns) -> None:
     ("words", "told"),
     [
         (["--algo", "r2d2"], "its algo is sqn, here it is r2d2"),
-        (["--network.hidden-size", "16"], "its network.hidden_size is 8, here it is 16"),
+        (
+            ["--network.hidden-size", "16"],
+            "its network.hidden_size is 8, here it is 16 (--network.hidden-size)",
+        ),
         (["--env.num-beams", "31"], "its env.num_beams is 71, here it is 31"),
         (["--env.heading-encoding", "sincos"], "its env.heading_encoding is linear, here"),
     ],
