@@ -174,15 +174,11 @@ def _scan_backward(
         to_inner = to_candidate * reset
         to_before = to_reset @ from_reset + to_update @ from_update + to_inner @ from_candidate
         # Written gate by gate, as they are read: a concatenation first would be scalar, too.
-        for place, *values in zip(
-            _places(later),
-            (to_reset, to_update, to_candidate),
-            (to_reset, to_update, to_inner),
-            strict=True,
-        ):
+        halves = (to_reset, to_update, to_candidate), (to_reset, to_update, to_inner)
+        for place, from_input, from_hidden in zip(_places(later), *halves, strict=True):
             start = (step, 0, place)
-            to_projected = jax.lax.dynamic_update_slice(to_projected, values[0][None], start)
-            to_recurrent = jax.lax.dynamic_update_slice(to_recurrent, values[1][None], start)
+            to_projected = jax.lax.dynamic_update_slice(to_projected, from_input[None], start)
+            to_recurrent = jax.lax.dynamic_update_slice(to_recurrent, from_hidden[None], start)
         return (total * update + to_before, to_projected, to_recurrent), None
 
     told: tuple[Array, Array, Array] = jax.lax.scan(
