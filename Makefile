@@ -36,10 +36,11 @@ table: $(INSTALLED)  ## train three agents, compare them on four maps, write the
 robustness: $(INSTALLED)  ## the same agents under noise, with the paper's figure
 	@$(BIN)/python experiments/robustness.py $(ARGS)
 
-lint: $(INSTALLED)  ## check style, format and types
+lint: $(INSTALLED)  ## check style, format, types, and who imports whom
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/lint-imports
 
 maps: $(INSTALLED)  ## draw the maps in maps/ anew
 	@$(BIN)/python experiments/draw_maps.py $(ARGS)

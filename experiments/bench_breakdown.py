@@ -12,13 +12,13 @@ from jax import Array
 
 from experiments.bench_simulator import draw_actions
 from experiments.timing import Program, four_digits, time_in_turns
-from sqn_jax import train
 from sqn_jax.agent import pqn
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
 from sqn_jax.env.dynamics import move
-from sqn_jax.rollout import draw_chance, start_fleet, unroll
-from sqn_jax.scores import markdown_table
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.training import loop
+from sqn_jax.training.rollout import draw_chance, start_fleet, unroll
 
 Piece = Callable[[EnvState, Array, EnvParams], tuple[EnvState, Any]]
 """One part of a step of one robot: state, action and world to the next state and a result."""
@@ -87,12 +87,12 @@ def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int
 
 def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program]:
     """The two halves of a window of recurrent PQN: drive it, learn from it."""
-    network = train.network_of(config)
-    runner = train.start_run(params, config)
+    network = loop.network_of(config)
+    runner = loop.start_run(params, config)
     key = jax.random.key(1)
     keys = jax.random.split(key, config.num_envs)
     fleet = jax.jit(lambda keys, params: start_fleet(keys, network, params))(keys, params)
-    num_steps = params.max_steps // train.num_windows(config, params)
+    num_steps = params.max_steps // loop.num_windows(config, params)
     epsilon = jnp.zeros(config.num_envs)
 
     @jax.jit
@@ -100,7 +100,7 @@ def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program
         chance = draw_chance(key, num_steps, config.num_envs)
         return unroll(chance, network, learner.params, fleet, epsilon, params)[1]
 
-    optimizer = train.optimizer_of(config, params)
+    optimizer = loop.optimizer_of(config, params)
 
     @jax.jit
     def learn(learner: Any, episodes: Any) -> Any:
@@ -129,7 +129,7 @@ def measure(
         for name, piece in PIECES.items()
     }
     windows = window_programs(config, params)
-    window_steps = params.max_steps // train.num_windows(config, params)
+    window_steps = params.max_steps // loop.num_windows(config, params)
     timings = time_in_turns(programs | windows, repeats)
     entries = []
     for name, timing in timings.items():

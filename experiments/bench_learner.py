@@ -25,14 +25,14 @@ from jax.sharding import Mesh, PartitionSpec
 
 from experiments.operations import update_operations
 from experiments.timing import Program, Timing, four_digits, time_in_turns
-from sqn_jax import devices, train
 from sqn_jax.agent import Episodes, QNetwork, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.scores import markdown_table
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.training import devices, loop
 
 Name = tuple[str, str]
 """What is timed, an agent or PRODUCT, and in which program."""
@@ -73,8 +73,8 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     capacity = STORED_BATCHES * batch_size
     settings = dataclasses.replace(config.replay, capacity=capacity, min_episodes=batch_size)
     config = dataclasses.replace(config, method="r2d2", num_envs=batch_size, replay=settings)
-    runner = train.start_run(env_params, config)
-    shapes = train.episode_shapes(config, env_params)
+    runner = loop.start_run(env_params, config)
+    shapes = loop.episode_shapes(config, env_params)
     rng = np.random.default_rng(config.seed)
     memory = runner.memory
     for _ in range(STORED_BATCHES):
@@ -82,8 +82,8 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     batches = [random_episodes(rng, shapes) for _ in range(num_updates)]
     return Problem(
         config=config,
-        network=train.network_of(config),
-        optimizer=train.optimizer_of(config, env_params),
+        network=loop.network_of(config),
+        optimizer=loop.optimizer_of(config, env_params),
         learner=runner.learner,
         memory=memory,
         episodes=jax.tree.map(lambda *x: jnp.stack(x), *batches),
@@ -153,7 +153,7 @@ def sampling_program(problem: Problem, mesh: Mesh | None) -> Program:
     """U whole updates: draw by priority, learn, store the priorities."""
     # The scan body of `r2d2.learn`, which without it would also store a round of new episodes.
     update = partial(r2d2._update, **_static(problem, mesh), discount=None)
-    held = (WHOLE, train.runner_specs(problem.config).memory)
+    held = (WHOLE, loop.runner_specs(problem.config).memory)
     scan = _scan(problem, update, mesh, held, WHOLE, WHOLE)
     num_updates = problem.weights.shape[0]
     return _carried_on(

@@ -18,9 +18,9 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from experiments.timing import Program, time_in_turns
-from sqn_jax import devices
 from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
-from sqn_jax.scores import markdown_table
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.training import devices
 
 Drive = Callable[[Array, Any, int], Any]
 """Takes a key, what a world is made of, and a number of robots N; returns arrays [T, N, ...]."""

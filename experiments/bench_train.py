@@ -10,11 +10,11 @@ from typing import Any
 import jax
 
 from experiments.timing import Timing, four_digits
-from sqn_jax import devices, train
 from sqn_jax.agent import r2d2, replay
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams
-from sqn_jax.scores import markdown_table
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.training import devices, loop
 
 
 def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[str, Any]:
@@ -30,8 +30,8 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
         compile and of the first call.
     """
     mesh = devices.choose(config)
-    runner = train.start_run(env_params, config, mesh)
-    program, compile_seconds = train.compile_chunk(env_params, config, mesh)
+    runner = loop.start_run(env_params, config, mesh)
+    program, compile_seconds = loop.compile_chunk(env_params, config, mesh)
     env_params = devices.place(env_params, mesh)
     warm_up = 0.0
     seconds: list[float] = []
@@ -48,7 +48,7 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
     timing = Timing(warm_up, tuple(seconds))
     rounds = config.rounds_per_chunk * config.num_seeds
     steps = rounds * config.num_envs * env_params.max_steps
-    updates_a_chunk = rounds * train.updates_a_round(config, env_params)
+    updates_a_chunk = rounds * loop.updates_a_round(config, env_params)
     return {
         "algo": config.algo,
         "method": config.method,
@@ -67,14 +67,14 @@ def memory(config: TrainConfig, env_params: EnvParams) -> dict[str, int]:
 
     `replay_bytes` is the replay (0 without one), `run_bytes` adds the episodes of one round.
     """
-    item = r2d2.packed_item(train.episode_shapes(config, env_params))
+    item = r2d2.packed_item(loop.episode_shapes(config, env_params))
     has_replay = config.method == "r2d2"
     capacity = config.replay.capacity if has_replay else 0
     return {
         "peak_process_bytes": peak_bytes(),
         "replay_episodes": capacity,
         "replay_bytes": replay.num_bytes(item, capacity) if has_replay else 0,
-        "run_bytes": train.memory_bytes(config, env_params),
+        "run_bytes": loop.memory_bytes(config, env_params),
     }
 
 

@@ -22,10 +22,10 @@ from typing import Any
 import sqn_jax
 from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import ALGORITHMS, run
-from sqn_jax import devices
+from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import make_env
-from sqn_jax.presets import PRESETS
-from sqn_jax.runlog import write_json
+from sqn_jax.storage.files import write_json
+from sqn_jax.training import devices
 
 PARTS = ("simulator", "learner", "train", "breakdown")
 

@@ -18,10 +18,10 @@ from jax import Array
 
 from experiments.common import run
 from experiments.timing import time_in_turns
-from sqn_jax import devices
 from sqn_jax.agent import gru, gru_kernel
 from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
-from sqn_jax.runlog import write_json
+from sqn_jax.storage.files import write_json
+from sqn_jax.training import devices
 
 ROBOTS, STEPS = 512, 100
 SIZES = ((1, 391, 64), (5, 391, 64), (1, 100, 16), (5, 100, 16))

@@ -9,13 +9,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sqn_jax.checkpoint import NotSaved
-from sqn_jax.compare import Settings, load_maps, with_references
 from sqn_jax.config import Algorithm, TrainConfig
-from sqn_jax.presets import PRESETS
-from sqn_jax.runlog import RunFolder
-from sqn_jax.session import train_session
-from sqn_jax.signals import Interrupted, interruptible, last_words, say_stopped
+from sqn_jax.config.presets import PRESETS
+from sqn_jax.evaluation.compare import Settings, load_maps, with_references
+from sqn_jax.runs.signals import Interrupted, interruptible, last_words, say_stopped
+from sqn_jax.runs.train import train_session
+from sqn_jax.storage.checkpoint import NotSaved
+from sqn_jax.storage.run_folder import RunFolder
 
 RESULTS = Path(__file__).resolve().parent / "results"
 ALGORITHMS: tuple[Algorithm, ...] = ("sqn", "r2d2", "dqn")

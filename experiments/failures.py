@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common import run
-from sqn_jax.compare import Agent, Driven, Learnt, Settings, World
-from sqn_jax.pretrained import find_policy
-from sqn_jax.runlog import write_json
-from sqn_jax.session import evaluate_session
+from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World
+from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.storage.files import write_json
 
 LAST_STEPS = 200
 STILL = 1.0

@@ -15,10 +15,10 @@ from typing import Any
 
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
+from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.evaluation.recording import Episode, record
 from sqn_jax.maps import load_map
-from sqn_jax.presets import PAPER_MAPS
-from sqn_jax.pretrained import find_policy
-from sqn_jax.recording import Episode, record
+from sqn_jax.policies.pretrained import find_policy
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "images"

@@ -11,8 +11,8 @@ import dataclasses
 from pathlib import Path
 
 from experiments.common import run
-from sqn_jax.interventions import single_head
-from sqn_jax.pretrained import SUFFIX, find_policy, write_policy
+from sqn_jax.policies.interventions import single_head
+from sqn_jax.policies.pretrained import SUFFIX, find_policy, write_policy
 
 
 def main() -> None:

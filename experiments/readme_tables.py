@@ -15,9 +15,9 @@ import numpy as np
 
 from experiments.common import recorded, run
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
-from sqn_jax.paper import PAPER_RESULTS
-from sqn_jax.presets import PAPER_MAPS
-from sqn_jax.scores import markdown_table
+from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.evaluation.paper_results import PAPER_RESULTS
+from sqn_jax.evaluation.scores import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sqn_jax.config import to_public_dict
-from sqn_jax.runlog import RunFolder
+from sqn_jax.storage.run_folder import RunFolder
 
 CURVE = (
     *("episodes", "wall_seconds", "updates", "mean_reward", "success", "epsilon", "loss"),

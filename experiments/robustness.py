@@ -17,10 +17,10 @@ from experiments.common import (
     run,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies
-from sqn_jax.policies import load_policy
-from sqn_jax.scores import results_table
-from sqn_jax.session import evaluate_session
+from sqn_jax.evaluation.compare import Settings, group_policies
+from sqn_jax.evaluation.scores import results_table
+from sqn_jax.policies.run_policies import load_policy
+from sqn_jax.runs.evaluate import evaluate_session
 
 VELOCITY_NOISE = (0.1, 0.2, 0.3)
 RANGE_NOISE = (0.2, 0.4, 0.6)

@@ -21,9 +21,9 @@ from typing import Any
 import jax
 
 from experiments.common import run
-from sqn_jax.policies import Policy, load_policy, require_same_network
-from sqn_jax.pretrained import find_policy, write_policy
-from sqn_jax.runlog import RunFolder
+from sqn_jax.policies.pretrained import find_policy, write_policy
+from sqn_jax.policies.run_policies import Policy, load_policy, require_same_network
+from sqn_jax.storage.run_folder import RunFolder
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
 

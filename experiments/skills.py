@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from experiments.common import run
-from sqn_jax.compare import Agent, Driven, Learnt, Settings, World
-from sqn_jax.interventions import fix_skill_weights, swap_skills
-from sqn_jax.policies import Policy
-from sqn_jax.pretrained import find_policy
-from sqn_jax.runlog import write_json
-from sqn_jax.session import evaluate_session
+from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World
+from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
+from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.storage.files import write_json
 
 AS_IT_IS = "as it is"
 NEW_GROUND = 0.1

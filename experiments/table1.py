@@ -20,13 +20,13 @@ from experiments.common import (
     run,
 )
 from sqn_jax import figures
-from sqn_jax.compare import Settings, group_policies, with_references
-from sqn_jax.paper import PAPER_RESULTS
-from sqn_jax.policies import load_policy
-from sqn_jax.presets import PAPER_MAPS
-from sqn_jax.runlog import RunFolder
-from sqn_jax.scores import markdown_table, results_table
-from sqn_jax.session import evaluate_session
+from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.evaluation.compare import Settings, group_policies, with_references
+from sqn_jax.evaluation.paper_results import PAPER_RESULTS
+from sqn_jax.evaluation.scores import markdown_table, results_table
+from sqn_jax.policies.run_policies import load_policy
+from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.storage.run_folder import RunFolder
 
 
 def paper_table(results: list[dict[str, Any]]) -> str:

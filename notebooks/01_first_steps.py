@@ -31,11 +31,11 @@ import numpy as np
 import sqn_jax
 from sqn_jax import figures
 from sqn_jax.env import ACTION_NAMES, NUM_ACTIONS
+from sqn_jax.evaluation.recording import record
+from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.figures.animation import gif
 from sqn_jax.maps import goal_distance, load_map, points_to_cells, traversable
-from sqn_jax.pretrained import find_policy
-from sqn_jax.recording import record
-from sqn_jax.scores import markdown_table
+from sqn_jax.policies.pretrained import find_policy
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
 EPISODES = 6 if SMALL else 100  # recorded on the maze

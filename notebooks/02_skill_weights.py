@@ -30,14 +30,14 @@ import os
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.compare import Learnt, Settings, evaluate_agents, load_maps
 from sqn_jax.env import ACTION_NAMES
-from sqn_jax.interventions import fix_skill_weights, swap_skills
+from sqn_jax.evaluation.compare import Learnt, Settings, evaluate_agents, load_maps
+from sqn_jax.evaluation.recording import record
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.statistics import bootstrap_interval
 from sqn_jax.maps import goal_fields, points_to_cells, traversable
-from sqn_jax.pretrained import find_policy
-from sqn_jax.recording import record
-from sqn_jax.scores import markdown_table
-from sqn_jax.statistics import bootstrap_interval
+from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
+from sqn_jax.policies.pretrained import find_policy
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
 EPISODES = 6 if SMALL else 200  # of each policy on each map

@@ -30,10 +30,10 @@ from pathlib import Path
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.compare import Learnt, Settings, evaluate_agents, load_maps, with_references
+from sqn_jax.evaluation.compare import Learnt, Settings, evaluate_agents, load_maps, with_references
+from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.maps import describe, load_map
-from sqn_jax.pretrained import find_policy
-from sqn_jax.scores import markdown_table
+from sqn_jax.policies.pretrained import find_policy
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
 EPISODES = 6 if SMALL else 200  # of each robot

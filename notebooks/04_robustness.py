@@ -27,9 +27,9 @@ from collections import Counter
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.compare import Learnt, Reference, Settings, evaluate_agents, load_maps
-from sqn_jax.pretrained import find_policy, pretrained_names
-from sqn_jax.scores import markdown_table
+from sqn_jax.evaluation.compare import Learnt, Reference, Settings, evaluate_agents, load_maps
+from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.policies.pretrained import find_policy, pretrained_names
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
 EPISODES = 6 if SMALL else 200  # of each agent at each level

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sqn_jax.env.coverage import Lattice
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.recording import Episode
 
 HEIGHT_M, WIDTH_M = 4.0, 6.0
 LATTICE = Lattice.over(HEIGHT_M, WIDTH_M, 0.25, 5.0)

@@ -14,7 +14,7 @@ from sqn_jax.agent.networks import QNetwork
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.rollout import start_fleet
+from sqn_jax.training.rollout import start_fleet
 
 
 def small_room(length: int, **changes: Any) -> EnvParams:

@@ -18,7 +18,7 @@ from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
 from sqn_jax.cli.train import train
-from sqn_jax.signals import Interrupted, interruptible, say_stopped
+from sqn_jax.runs.signals import Interrupted, interruptible, say_stopped
 
 USAGE = """usage: sqn COMMAND [OPTIONS]
 

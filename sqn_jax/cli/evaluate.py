@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sqn_jax.cli.words import CACHE, TASKS, Parser, add_checkpoint, add_device
-from sqn_jax.presets import PAPER_MAPS
+from sqn_jax.config.presets import PAPER_MAPS
 
 
 def evaluate(words: list[str]) -> int:
@@ -40,11 +40,12 @@ def evaluate(words: list[str]) -> int:
     options = parser.parse_args(words)
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
-    from sqn_jax import compare, devices
+    from sqn_jax.evaluation import compare
+    from sqn_jax.evaluation.scores import results_table
     from sqn_jax.maps import split_names
-    from sqn_jax.pretrained import find_policy
-    from sqn_jax.scores import results_table
-    from sqn_jax.session import evaluate_session
+    from sqn_jax.policies.pretrained import find_policy
+    from sqn_jax.runs.evaluate import evaluate_session
+    from sqn_jax.training import devices
 
     devices.require(options.device)
     noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
@@ -80,7 +81,8 @@ def evaluate(words: list[str]) -> int:
 
 
 def _require_writable(path: Path) -> None:
-    from sqn_jax.runlog import CONFIG, OWN_NAMES, probe_writable
+    from sqn_jax.storage.files import probe_writable
+    from sqn_jax.storage.run_folder import CONFIG, OWN_NAMES
 
     if path.suffix != ".json":
         raise ValueError(f"--out is {path}, expected a file ending in .json")

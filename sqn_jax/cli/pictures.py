@@ -36,9 +36,9 @@ def report(words: list[str]) -> int:
         if error.name != "matplotlib":
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
-    from sqn_jax import devices
-    from sqn_jax.compare import Settings
+    from sqn_jax.evaluation.compare import Settings
     from sqn_jax.maps import split_names
+    from sqn_jax.training import devices
 
     devices.require(options.device)
     pages.require_writable(options.out)
@@ -84,11 +84,11 @@ def render(words: list[str]) -> int:
     options = parser.parse_args(words)
     if not options.runs:
         raise ValueError("nothing to render: name a run folder or pretrained:NAME")
-    from sqn_jax import devices
-    from sqn_jax.pretrained import find_policy
+    from sqn_jax.policies.pretrained import find_policy
+    from sqn_jax.training import devices
 
     try:
-        from sqn_jax import render as pictures
+        from sqn_jax.report import render as pictures
     except ModuleNotFoundError as error:
         if not (error.name or "").startswith("matplotlib"):
             raise

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from sqn_jax.cli.words import CACHE, Parser, add_device, folder
 from sqn_jax.config import TrainConfig
-from sqn_jax.presets import PRESETS
-from sqn_jax.signals import last_words
+from sqn_jax.config.presets import PRESETS
+from sqn_jax.runs.signals import last_words
 
 
 def train(words: list[str]) -> int:
@@ -49,7 +49,7 @@ def _resumed_config(own: argparse.Namespace, others: list[str]) -> TrainConfig:
             "--total-episodes, --device, --num-devices and --tensorboard, got "
             f"{' '.join(unknown) or '--preset'}"
         )
-    from sqn_jax.runlog import RunFolder
+    from sqn_jax.storage.run_folder import RunFolder
 
     _, config = RunFolder.open(own.run_dir)
     if changes.total_episodes is None:
@@ -110,8 +110,8 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
 
 
 def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -> int:
-    from sqn_jax import devices
-    from sqn_jax.session import train_session
+    from sqn_jax.runs.train import train_session
+    from sqn_jax.training import devices
 
     devices.use_cores()
     devices.require(own.device)
@@ -134,7 +134,7 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
 def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
     """Files and folders stay findable when the run is resumed from another folder."""
     from sqn_jax.maps import weighted_names
-    from sqn_jax.pretrained import PREFIX
+    from sqn_jax.policies.pretrained import PREFIX
 
     start = config.start_from
     if start and not start.startswith(PREFIX):

@@ -10,8 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
-from sqn_jax.checks import require
 from sqn_jax.config.run import TrainConfig
+from sqn_jax.config.validation import require
 
 
 def to_dict(config: Any) -> dict[str, Any]:

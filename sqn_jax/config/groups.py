@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from sqn_jax.checks import (
+from sqn_jax.config.validation import (
     require,
     require_known_words,
     require_not_negative,

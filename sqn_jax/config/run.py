@@ -6,12 +6,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sqn_jax.checks import (
-    require,
-    require_known_words,
-    require_not_negative,
-    require_positive,
-)
 from sqn_jax.config.groups import (
     EnvConfig,
     EvalConfig,
@@ -20,6 +14,12 @@ from sqn_jax.config.groups import (
     NetworkConfig,
     RandomizationConfig,
     ReplayConfig,
+)
+from sqn_jax.config.validation import (
+    require,
+    require_known_words,
+    require_not_negative,
+    require_positive,
 )
 
 Algorithm = Literal["sqn", "r2d2", "dqn"]

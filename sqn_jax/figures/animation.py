@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.screen import HEIGHT, KEY_COLOURS, WIDTH, Screen, last_step, rgb
-from sqn_jax.recording import Episode
-from sqn_jax.runlog import written_whole
+from sqn_jax.storage.files import written_whole
 
 Frame = NDArray[np.uint8]
 

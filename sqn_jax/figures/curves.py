@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from sqn_jax.evaluation.statistics import bootstrap_interval
 from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
-from sqn_jax.statistics import bootstrap_interval
 
 Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]

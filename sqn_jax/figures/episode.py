@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import (
     SEEN,
     YELLOW,
@@ -25,7 +26,6 @@ from sqn_jax.figures.ground import (
     mark_arrival,
 )
 from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
-from sqn_jax.recording import Episode
 
 Floats = NDArray[np.floating]
 

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import arrowhead, draw_map
 from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.recording import Episode
 
 MAX_SCANS = 6  # below each map of `observation_patterns`
 

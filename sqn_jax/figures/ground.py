@@ -19,9 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.style import COLOURS, INK, OBSTACLE
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.recording import Episode
 
 Floats = NDArray[np.floating]
 

@@ -17,6 +17,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
+from sqn_jax.evaluation.recording import Episode, covered_bits
 from sqn_jax.figures.ground import (
     FREE,
     ONE_SKILL,
@@ -28,7 +29,6 @@ from sqn_jax.figures.ground import (
     skill_colour,
 )
 from sqn_jax.figures.style import COLOURS, INK, OBSTACLE, tidy
-from sqn_jax.recording import Episode, covered_bits
 
 WIDTH, HEIGHT = 800, 580
 """The frame that all places below are measured in, pixels; others are that frame scaled."""

@@ -12,6 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import (
     draw_field,
     draw_map,
@@ -22,7 +23,6 @@ from sqn_jax.figures.ground import (
 )
 from sqn_jax.figures.style import DPI, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
-from sqn_jax.recording import Episode
 
 MAX_AGENTS = 5  # columns of `agents_side_by_side`; more would be too narrow for their titles
 MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit a page

@@ -10,7 +10,7 @@ from typing import BinaryIO
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sqn_jax.runlog import written_whole
+from sqn_jax.storage.files import written_whole
 
 DPI = 160
 WIDTH_IN = 9.0

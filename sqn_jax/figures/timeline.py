@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import mark_arrival, skill_colour
 from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
-from sqn_jax.recording import Episode
 
 _REWARD_PARTS = ("navigation", "exploration", "time")
 _PART_STYLES = ((COLOURS[2], "-"), (COLOURS[5], "--"), ("#7a7a7a", "-."))

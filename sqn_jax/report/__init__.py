@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sqn_jax.compare import Settings
-from sqn_jax.compilation import kept_programs
+from sqn_jax.evaluation.compare import Settings
 from sqn_jax.report.content import Run, gather, read_runs
 from sqn_jax.report.page import require_writable, to_html, write
 from sqn_jax.report.pictures import draw
+from sqn_jax.storage.compile_cache import kept_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 

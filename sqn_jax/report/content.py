@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from sqn_jax import config as configs
-from sqn_jax.compare import (
+from sqn_jax.config import TrainConfig
+from sqn_jax.config.presets import PRESETS
+from sqn_jax.evaluation.compare import (
     Agent,
     Driven,
     Learnt,
@@ -24,13 +26,11 @@ from sqn_jax.compare import (
     num_episodes,
     with_references,
 )
-from sqn_jax.config import TrainConfig
-from sqn_jax.policies import Policy
-from sqn_jax.presets import PRESETS
-from sqn_jax.pretrained import find_policy, names_a_run
-from sqn_jax.progress import episodes_bar
+from sqn_jax.policies.pretrained import find_policy, names_a_run
+from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.episodes import Drive, Hard, hardest
-from sqn_jax.runlog import RunFolder
+from sqn_jax.runs.progress import episodes_bar
+from sqn_jax.storage.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def read_runs(words: Sequence[str], checkpoint: int | str = "newest") -> list[Ru
 
     Args:
         words: the names.
-        checkpoint: which of each run, see `policies.load_policy`.
+        checkpoint: which of each run, see `run_policies.load_policy`.
 
     Raises:
         ValueError: one is not there, or damaged.

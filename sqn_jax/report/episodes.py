@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.compare import Learnt, World
-from sqn_jax.planners import shortest_ways
-from sqn_jax.rollout import EpisodeSummary
+from sqn_jax.baselines.shortest_paths import shortest_ways
+from sqn_jax.evaluation.compare import Learnt, World
+from sqn_jax.training.rollout import EpisodeSummary
 
 Floats = NDArray[np.floating]
 

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from sqn_jax import config as configs
-from sqn_jax.compare import Settings
-from sqn_jax.paper import PAPER_RESULTS
-from sqn_jax.presets import PAPER_MAPS
+from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.evaluation.compare import Settings
+from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import NEAR, Hard
 from sqn_jax.report.pictures import Picture, Pictures, policy_words
-from sqn_jax.runlog import CONFIG, probe_writable, written_whole
+from sqn_jax.storage.files import probe_writable, written_whole
+from sqn_jax.storage.run_folder import CONFIG
 
 _REFERENCES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
 

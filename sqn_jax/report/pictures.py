@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.compare import Learnt, task_key
-from sqn_jax.evaluate import episode_keys
+from sqn_jax.evaluation.compare import Learnt, task_key
+from sqn_jax.evaluation.episodes import episode_keys
+from sqn_jax.evaluation.recording import Episode, on_host, record_episodes
 from sqn_jax.figures.animation import gif
-from sqn_jax.recording import Episode, on_host, record_episodes
 from sqn_jax.report.content import Content, Run
 from sqn_jax.report.episodes import NEAR, Drive, Hard, Place
 

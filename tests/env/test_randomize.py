@@ -16,7 +16,7 @@ from sqn_jax.env import EnvParams, make_env, navigation
 from sqn_jax.env.prepare import with_noise
 from sqn_jax.env.randomize import randomized, robot_axes, robots_own
 from sqn_jax.maps import load_map
-from sqn_jax.rollout import own_worlds
+from sqn_jax.training.rollout import own_worlds
 
 ALL = RandomizationConfig(velocity_noise=0.3, range_noise=0.6, speed=0.2)
 COUNT = 256

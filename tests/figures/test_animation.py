@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sqn_jax.env.coverage import Lattice
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures import animation
 from sqn_jax.figures.animation import frames, gif, mp4, shown_steps
 from sqn_jax.figures.screen import Screen
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.recording import Episode
 
 STEPS = 60
 # What the colours of the film mean, as they are seen.

@@ -14,8 +14,8 @@ from matplotlib import pyplot
 from matplotlib.patches import Polygon
 
 from sqn_jax import figures
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures import ground
-from sqn_jax.recording import Episode
 
 
 def polygons(axes: Any, corners: int) -> list[Any]:

@@ -14,9 +14,9 @@ from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 
 from sqn_jax import figures
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures import style
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.recording import Episode
 
 # Skills.
 

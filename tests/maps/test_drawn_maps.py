@@ -13,8 +13,8 @@ from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standi
 from numpy.typing import NDArray
 from scipy import ndimage, spatial
 
+from sqn_jax.baselines.shortest_paths import steps_between
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map
-from sqn_jax.planners import steps_between
 
 NAMES = ("column", "forest", "cave")
 FORK = (35.0, 31.0)  # m; from the upper left corner 35 m to the right and 20 m down

@@ -13,10 +13,10 @@ import pytest
 from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standing_room
 from scipy import ndimage, spatial
 
+from sqn_jax.baselines.shortest_paths import steps_between
 from sqn_jax.maps import load_map, validate
 from sqn_jax.maps.generate import KINDS, generate
 from sqn_jax.maps.terrain import carve_tunnels, fill_pockets, smooth_path, spread, value_noise
-from sqn_jax.planners import steps_between
 
 SCRIPT = Path(__file__).resolve().parents[2] / "experiments/draw_maps.py"
 SEEDS = {"maze": 30, "column": 30, "forest": 30, "cave": 5}

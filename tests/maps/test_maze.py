@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sqn_jax.baselines.shortest_paths import oracle_steps
 from sqn_jax.maps import (
     OccupancyMap,
     connected_components,
@@ -21,7 +22,6 @@ from sqn_jax.maps import (
     traversable,
 )
 from sqn_jax.maps.check import evaluation_distances
-from sqn_jax.planners import oracle_steps
 
 ROOT = Path(__file__).resolve().parents[2]
 

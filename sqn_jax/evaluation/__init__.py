@@ -1,0 +1,1 @@
+"""Episodes of policies and baselines, their scores and statistics."""

@@ -1,0 +1,1 @@
+"""Trained policies: from run folders, from files, changed by hand."""

@@ -1,0 +1,119 @@
+"""Trained policies as an evaluation takes them: read from a run folder, nothing else needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from sqn_jax import config as configs
+from sqn_jax.agent.networks import Params, initial_carry
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import Observation
+from sqn_jax.storage.checkpoint import Checkpoints
+from sqn_jax.storage.manifest import Origin
+from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
+from sqn_jax.training.loop import RunnerState, averages, network_of
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The policies of one training run, one for each of its seeds."""
+
+    name: str
+    """The run folder's name."""
+    config: TrainConfig
+    """How they were trained: network, robot, sensors."""
+    params: tuple[Params, ...]
+    """Parameters, one tree a training seed."""
+
+    @property
+    def training_seeds(self) -> tuple[int, ...]:
+        """The seeds, in the order of `params`."""
+        return tuple(self.config.seed + index for index in range(self.config.num_seeds))
+
+
+def params_shapes(config: TrainConfig) -> Params:
+    """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
+
+    They follow from the config alone: the map need not be at hand.
+    """
+    goal_size = 2 if config.env.heading_encoding == "linear" else 3
+    obs = Observation(
+        ranges=jnp.zeros((1, 1, config.env.num_beams)), goal=jnp.zeros((1, 1, goal_size))
+    )
+    carry = initial_carry(config.network, 1)
+    shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
+    if config.num_seeds == 1:
+        return shapes
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((config.num_seeds, *x.shape), x.dtype), shapes
+    )
+
+
+def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
+    """Read a policy from a checkpoint of a run folder.
+
+    Args:
+        run_dir: the folder.
+        checkpoint: "newest", "best" (by success in training, over the chunks since the one before)
+            or the number of chunks it was saved after.
+
+    Raises:
+        ValueError: it is no run folder, its config is unusable, or it holds no such checkpoint, or
+            a damaged one.
+        Mismatch: the checkpoint is of another run than the config says.
+    """
+    _, config = RunFolder.open(run_dir)
+    if not (run_dir / CHECKPOINTS).is_dir():
+        raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
+    with Checkpoints(run_dir, Origin(config)) as checkpoints:
+        params = checkpoints.restore_policy(
+            params_shapes(config), averaged=averages(config), which=checkpoint
+        )
+    return Policy(run_dir.resolve().name, config, seeds_of(params, config))
+
+
+def seeds_of(params: Params, config: TrainConfig) -> tuple[Params, ...]:
+    """The parameters of each seed, out of those of a whole run."""
+    if config.num_seeds == 1:
+        return (params,)
+    return tuple(jax.tree.map(lambda x, i=i: x[i], params) for i in range(config.num_seeds))
+
+
+def require_same_network(policy: Policy, config: TrainConfig) -> None:
+    """Check that a run can start from a policy.
+
+    Raises:
+        ValueError: the policy is of another network, or sees other observations.
+    """
+    theirs, ours = (configs.flat(configs.to_dict(run)) for run in (policy.config, config))
+    decisive = ["algo", "env.num_beams", "env.heading_encoding"]
+    decisive += [name for name in ours if name.startswith("network.")]
+    for name in decisive:
+        if theirs[name] != ours[name]:
+            raise ValueError(
+                f"--start-from {config.start_from}: its {name} is {theirs[name]}, here it is "
+                f"{ours[name]} (--{name.replace('_', '-')})"
+            )
+
+
+def started_from(runner: RunnerState, policy: Policy) -> RunnerState:
+    """The state of a new run whose parameters are those of a policy, of its first seed."""
+
+    def filled(fresh: Params) -> Params:
+        return jax.tree.map(
+            lambda mine, theirs: jax.device_put(
+                jnp.array(jnp.broadcast_to(theirs, mine.shape)), mine.sharding
+            ),
+            fresh,
+            policy.params[0],
+        )
+
+    learner = runner.learner
+    target = None if learner.target_params is None else filled(learner.target_params)
+    learner = dataclasses.replace(learner, params=filled(learner.params), target_params=target)
+    return dataclasses.replace(runner, learner=learner)

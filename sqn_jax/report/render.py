@@ -1,0 +1,209 @@
+"""Films and pictures of what trained policies do on a map: what `sqn render` does.
+
+Every policy drives the same tasks, `recording` keeps them whole, `figures` draws them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from sqn_jax import figures
+from sqn_jax.config import EnvConfig
+from sqn_jax.evaluation.compare import Learnt, Settings, Tasks, World, load_maps, robot_for, worlds
+from sqn_jax.evaluation.recording import Episode, record_world
+from sqn_jax.figures import animation
+from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.storage.compile_cache import kept_programs
+from sqn_jax.storage.files import probe_writable, written_whole
+
+MOST_EPISODES = 32
+"""Of each policy; an episode in the cave takes 7 MB of memory."""
+
+Episodes = Mapping[str, list[Episode]]
+
+
+@kept_programs()
+def render_session(
+    policies: Sequence[Policy],
+    out: Path,
+    *,
+    map_name: str = "maze",
+    tasks: Tasks = "evaluation points",
+    episodes: int = 4,
+    animations: int = 1,
+    seed: int = 1_000,
+    noise: tuple[float, float] = (0.0, 0.0),
+    max_steps: int = 0,
+    mp4: bool = False,
+) -> list[Path]:
+    """Drive policies greedily and draw what they did, telling the terminal about it.
+
+    Args:
+        policies: who drives, with the first of its training seeds.
+        out: the folder to write into; made where it is missing, files of the same names replaced.
+        map_name: a map of the project, or a file.
+        tasks: from the evaluation points or between random pairs of spawn points.
+        episodes: of each policy, 1 to 32; the first ones of `sqn evaluate`'s.
+        animations: films of each policy, 0 to `episodes`.
+        seed: the evaluation seed.
+        noise: of the velocity and of the ranges, in the units each policy was configured with.
+        max_steps: steps an episode; 0 for the map's own limit.
+        mp4: write every film as MP4, too.
+
+    Returns:
+        The files written: the paths (of several agents side by side, task by task), and for each
+        agent a timeline of its first episode and its films.
+
+    Raises:
+        ValueError: an option is out of its range, the map is unusable for a robot, there are too
+            many policies, or the folder cannot be written.
+    """
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise ValueError(f"episodes is {episodes}, expected 1 to {MOST_EPISODES}")
+    if not 0 <= animations <= episodes:
+        raise ValueError(f"animations is {animations}, expected 0 to the {episodes} episodes")
+    if mp4:
+        animation.require_mp4()
+    settings = Settings(
+        maps=(map_name,),
+        tasks=(tasks,),
+        episodes=episodes,
+        eval_seeds=1,
+        seed=seed,
+        noise=(noise,),
+        max_steps=max_steps,
+    )
+    agents = {name: Learnt(name, (policy,)) for name, policy in agent_names(policies).items()}
+    maps = load_maps(list(agents.values()), settings)
+    _make_folder(out)
+    ready: dict[EnvConfig, World] = {}
+    driven: dict[str, list[Episode]] = {}
+    for name, agent in agents.items():
+        robot = robot_for(agent.env_config, settings)
+        if robot not in ready:
+            print(f"preparing {map_name} for the robot ...", flush=True)
+            (ready[robot],) = worlds(robot, maps, settings)
+        print(f"{name} drives ...", end="", flush=True)
+        told = record_world(agent.policies[0], ready[robot], episodes=episodes, seed=seed)
+        driven[name] = [dataclasses.replace(episode, agent=name) for episode in told]
+        print(f"\r{name}: {_outcome(told)}")
+    return _draw(driven, out, tasks=tasks, animations=animations, mp4=mp4)
+
+
+def agent_names(policies: Sequence[Policy]) -> dict[str, Policy]:
+    """What the policies are called in pictures: as their network, and as their run if need be.
+
+    Those that would be called the same are numbered; of several training seeds the first drives.
+
+    Raises:
+        ValueError: there is none, or there are too many to stand side by side.
+    """
+    if not 1 <= len(policies) <= MAX_AGENTS:
+        raise ValueError(f"{len(policies)} policies to render, expected 1 to {MAX_AGENTS}")
+    algorithms = [policy.config.algo for policy in policies]
+    names: dict[str, Policy] = {}
+    for policy in policies:
+        name = policy.config.algo.upper()
+        if algorithms.count(policy.config.algo) > 1:
+            name += f" {policy.name}"
+        if len(policy.params) > 1:
+            name += f" seed {policy.training_seeds[0]}"
+        taken = [_file_name(other) for other in names]
+        number, full = 1, name
+        while _file_name(full) in taken:
+            number += 1
+            full = f"{name} ({number})"
+        names[full] = policy
+    return names
+
+
+def default_folder(policies: Sequence[Policy], map_name: str) -> Path:
+    """`renders/NAME_MAP` below the current folder."""
+    name = policies[0].name
+    if len(policies) > 1:
+        name += f"_and_{len(policies) - 1}_more"
+    return Path("renders") / f"{name}_{Path(map_name).stem}"
+
+
+def _file_name(agent: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", agent.lower()).strip("_")
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe_writable(out)
+    except OSError as error:
+        raise ValueError(f"folder {out}: cannot be written ({error.strerror})") from None
+
+
+def _outcome(episodes: Sequence[Episode]) -> str:
+    reached = [episode.time_steps for episode in episodes if episode.success]
+    told = f"{len(reached)} of {len(episodes)} goals reached"
+    return told + (f", {sum(reached) / len(reached):.0f} steps on average" if reached else "")
+
+
+def _draw(driven: Episodes, out: Path, *, tasks: Tasks, animations: int, mp4: bool) -> list[Path]:
+    """Write all files under a progress bar; returns them."""
+    where = next(iter(driven.values()))[0].occupancy_map.name
+    jobs: dict[Path, Callable[[Path], None]] = {}
+    jobs[out / "trajectories.png"] = partial(_draw_paths, driven, f"{where}, {tasks}")
+    for name, episodes in driven.items():
+        title = f"{name} on {where}, {tasks}, episode 1"
+        file = _file_name(name)
+        jobs[out / f"{file}_timeline_1.png"] = partial(_draw_timeline, episodes[0], title)
+        for number, episode in enumerate(episodes[:animations], start=1):
+            jobs[out / f"{file}_episode_{number}.gif"] = partial(_draw_gif, episode)
+            if mp4:
+                jobs[out / f"{file}_episode_{number}.mp4"] = partial(_draw_mp4, episode)
+    for path, draw in tqdm(
+        jobs.items(),
+        mininterval=0.5 if sys.stderr.isatty() else 20,
+        dynamic_ncols=True,
+        bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} files [{elapsed}]",
+    ):
+        draw(path)
+    for path in jobs:
+        print(f"wrote {path} ({_size(path.stat().st_size)})")
+    return list(jobs)
+
+
+def _draw_paths(driven: Episodes, title: str, path: Path) -> None:
+    """One agent's paths on one map, several agents task by task."""
+    if len(driven) == 1:
+        ((name, episodes),) = driven.items()
+        figures.save(figures.skill_trajectories(episodes, title=f"{name} on {title}"), path)
+        return
+    first = {name: episodes[:MAX_TASKS] for name, episodes in driven.items()}
+    count = max(len(episodes) for episodes in driven.values())
+    if count > MAX_TASKS:
+        title += f", the first {MAX_TASKS} of {count} tasks"
+    figures.save(figures.agents_side_by_side(first, title=title), path)
+
+
+def _draw_timeline(episode: Episode, title: str, path: Path) -> None:
+    figures.save(figures.episode_timeline(episode, title=title), path)
+
+
+def _draw_gif(episode: Episode, path: Path) -> None:
+    film = animation.gif(episode)
+    with written_whole(path) as partial_path:
+        partial_path.write_bytes(film)
+
+
+def _draw_mp4(episode: Episode, path: Path) -> None:
+    animation.mp4(path, episode)
+
+
+def _size(number_of_bytes: int) -> str:
+    if number_of_bytes < 1e6:
+        return f"{number_of_bytes / 1e3:.0f} kB"
+    return f"{number_of_bytes / 1e6:.1f} MB"

@@ -1,0 +1,1 @@
+"""A training run as a person starts it: progress, signals, files, what follows it."""

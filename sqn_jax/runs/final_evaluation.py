@@ -1,0 +1,134 @@
+"""What follows a training run: its evaluation, its figures, its summary."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+
+import sqn_jax
+from sqn_jax.config import TrainConfig
+from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
+from sqn_jax.maps import OccupancyMap, split_names
+from sqn_jax.policies.run_policies import Policy, seeds_of
+from sqn_jax.storage.run_folder import RunFolder
+from sqn_jax.training import devices
+from sqn_jax.training.loop import RunnerState, policy_params
+from sqn_jax.training.rollout import EpisodeSummary, Trace
+
+Drawn = dict[str, tuple[EpisodeSummary, Trace]]
+"""For each kind of task, the episodes of the first seed."""
+
+
+def evaluate(
+    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+) -> tuple[list[dict[str, Any]], Drawn]:
+    """Greedy episodes of every seed from the evaluation points and from random pairs.
+
+    Args:
+        runner: the final state.
+        occupancy_map: the first map of the run.
+        config: of the run.
+        folder: of the run.
+    """
+    name = split_names(config.map)[0]
+    # On one device: every program that is given them would else run on each of the mesh.
+    params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
+    policy = Policy(folder.path.name, config, seeds_of(params, config))
+    settings = Settings(
+        maps=(name,),
+        tasks=("evaluation points", "random pairs"),
+        episodes=config.eval.episodes,
+        eval_seeds=1,
+        seed=config.eval.seed,
+        noise=((config.env.velocity_noise, config.env.range_noise),),
+        goal_radii=(config.env.goal_radius,),
+        max_steps=config.env.max_steps,
+    )
+    drawn: Drawn = {}
+
+    def keep(_: Agent, world: World, index: int, driven: Driven) -> None:
+        if index == 0:
+            drawn[world.tasks] = (driven[0][0], driven[1])
+
+    evaluation, records = evaluate_agents(
+        [Learnt(config.algo, (policy,))],
+        {(name, config.env.robot_radius): occupancy_map},
+        settings,
+        on_driven=keep,
+    )
+    folder.write_json("evaluation.json", evaluation)
+    folder.write_records("evaluation.jsonl", records)
+    return evaluation["results"], drawn
+
+
+def draw(drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder) -> bool:
+    """Write the figures; says so and returns False where Matplotlib is not installed."""
+    try:
+        from sqn_jax import figures
+    except ImportError:
+        print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
+        return False
+    name = f"{config.algo.upper()} on {occupancy_map.name}"
+    if (count := len(split_names(config.map))) > 1:
+        name += f" (trained on {count} maps)"
+    curve = figures.learning_curve(folder.read_metrics(), title=name)
+    figures.save(curve, folder.figures / "learning_curve.png")
+    for tasks, (summary, trace) in drawn.items():
+        drawing = figures.trajectories(
+            occupancy_map,
+            trace.goals,
+            trace.poses,
+            trace.skill_weights,
+            summary.success,
+            summary.time_steps,
+            goal_radius=config.env.goal_radius,
+            robot_radius=config.env.robot_radius,
+            title=f"{name}, {tasks}" + (f", seed {config.seed}" if config.num_seeds > 1 else ""),
+        )
+        figures.save(drawing, folder.figures / f"trajectories_{tasks.replace(' ', '_')}.png")
+    return True
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.1f} s"
+
+
+def conclude(
+    results: list[dict[str, Any]],
+    timing: dict[str, float],
+    figures: bool,
+    config: TrainConfig,
+    folder: RunFolder,
+) -> None:
+    """Write summary.json and say what it came to."""
+    summary: dict[str, Any] = {
+        "episodes": config.num_rounds * config.num_envs,
+        "wall_seconds": round(timing["train_seconds"], 1),
+        "compile_seconds": round(timing["compile_seconds"], 1),
+        "compiled_earlier": bool(timing["compiled_earlier"]),
+        "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
+        "device": devices.words(),
+        "num_devices": timing["num_devices"],
+        "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
+    }
+    print(
+        f"trained in {_duration(summary['wall_seconds'])} "
+        f"({summary['steps_per_second']:,} steps a second)"
+    )
+    for entry in results:
+        tasks = entry["tasks"]
+        summary[tasks.replace(" ", "_")] = {
+            "success": entry["success"]["mean"],
+            "time_steps": entry["time_steps"]["mean"],
+        }
+        low, high = entry["success"]["ci95"]
+        print(
+            f"{tasks + ':':19} success {entry['success']['mean']:.2f} "
+            f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
+            f"({config.eval.episodes} greedy episodes"
+            + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
+        )
+    folder.write_json("summary.json", summary)
+    if figures:
+        print(f"figures in {folder.figures}")

@@ -1,0 +1,324 @@
+"""A training run or an evaluation as a person starts it: progress, checkpoints, files, figures.
+
+The numbers come from `train` and `evaluate`; this module decides what is said and written when.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax.sharding import Mesh
+
+from sqn_jax.config import TrainConfig
+from sqn_jax.env import EnvParams, make_env
+from sqn_jax.maps import load_map, split_names
+from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
+from sqn_jax.runs import divergence, final_evaluation
+from sqn_jax.runs.progress import episodes_bar
+from sqn_jax.runs.signals import Interrupted, collected
+from sqn_jax.runs.tensorboard import Board, require_tensorboard
+from sqn_jax.storage import manifest
+from sqn_jax.storage.checkpoint import Checkpoints
+from sqn_jax.storage.compile_cache import kept_programs, watched_compilation
+from sqn_jax.storage.lock import locked
+from sqn_jax.storage.manifest import Manifest, Origin
+from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder
+from sqn_jax.training import devices, memory_budget
+from sqn_jax.training.loop import (
+    ChunkProgram,
+    ChunkReport,
+    RunnerState,
+    compile_chunk,
+    memory_bytes,
+    num_windows,
+    run,
+    runner_shapes,
+    start_run,
+)
+
+
+@kept_programs()
+def train_session(
+    config: TrainConfig,
+    run_dir: Path,
+    *,
+    resume: bool = False,
+    num_devices: int | None = None,
+    tensorboard: bool = False,
+) -> None:
+    """Train, evaluate and draw, telling the terminal about it.
+
+    Args:
+        config: the settings; of a resumed run those in its folder, with more episodes perhaps.
+        run_dir: where everything goes.
+        resume: go on from the newest sound checkpoint in `run_dir`; from the beginning if the run
+            was stopped before its first.
+        num_devices: see `devices.choose`.
+        tensorboard: write metrics and pictures for TensorBoard, too.
+
+    Raises:
+        ValueError: the map, the folder or the number of devices is unusable, the run does not fit
+            into memory, or tensorboardX is asked for and not installed.
+        Mismatch: the checkpoints are of another run.
+        NotSaved: a checkpoint could not be written.
+        Diverged: the parameters are lost.
+        Interrupted: by a signal; a chunk was finished and saved.
+    """
+    devices.use_cores()
+    mesh = devices.choose(config, num_devices)
+    start = None if resume else _starting_policy(config)
+    occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
+    env_params = make_env(occupancy_map, config.env)
+    # Refuses a window that does not fit before anything is written.
+    num_windows(config, env_params)
+    held = memory_bytes(config, env_params)
+    memory_budget.require(held, "keeping its episodes", config.method)
+    if tensorboard:
+        require_tensorboard()
+    origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
+    with ExitStack() as stack:
+        stack.enter_context(locked(run_dir))
+        folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
+        checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
+        runner = _restored(env_params, config, mesh, folder, checkpoints) if resume else None
+        _announce(config, env_params, run_dir, mesh, held)
+        done = 0 if runner is None else _rounds_done(runner) * config.num_envs
+        board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
+        if runner is None and resume:
+            start = _starting_policy(config)
+        training = _Training(env_params, config, mesh, folder, checkpoints, start)
+        runner = training.drive(runner, None if board is None else board.scalars)
+        if occupancy_map.tiles != (1, 1):
+            first = split_names(config.map)[0]
+            occupancy_map = load_map(first, robot_radius=config.env.robot_radius)
+        results, drawn = final_evaluation.evaluate(runner, occupancy_map, config, folder)
+        figures = final_evaluation.draw(drawn, occupancy_map, config, folder)
+        if board is not None and figures:
+            for path in sorted(folder.figures.glob("*.png")):
+                board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
+    final_evaluation.conclude(results, training.timing, figures, config, folder)
+
+
+def _starting_policy(config: TrainConfig) -> Policy | None:
+    """The policy that a run is to start from, if any."""
+    if not config.start_from:
+        return None
+    policy = find_policy(config.start_from)
+    require_same_network(policy, config)
+    return policy
+
+
+def _announce(
+    config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None, held: int
+) -> None:
+    seeds = f"seed {config.seed}"
+    if config.num_seeds > 1:
+        seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
+    episodes = config.num_rounds * config.num_envs
+    start = f"starting from {config.start_from}\n" if config.start_from else ""
+    print(
+        f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
+        f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
+        f"{start}run folder {run_dir}, device {devices.words(mesh)}, "
+        f"episodes in memory {held / 1e6:,.1f} MB"
+    )
+    if config.method == "r2d2" and not config.checkpoint_replay:
+        print("checkpoints without the replay: a run that is stopped does not go on exactly")
+
+
+def _restored(
+    env_params: EnvParams,
+    config: TrainConfig,
+    mesh: Mesh | None,
+    folder: RunFolder,
+    checkpoints: Checkpoints,
+) -> RunnerState | None:
+    """The state to go on from; None if the run was stopped before its first checkpoint.
+
+    From here on the folder is that of a run with this config, as far as it has come.
+    """
+    runner, chunks = None, 0
+    if checkpoints.chunks():
+        runner, told = checkpoints.restore(runner_shapes(env_params, config, mesh))
+        chunks = _rounds_done(runner) // config.rounds_per_chunk
+        if chunks > config.num_chunks:
+            episodes = chunks * config.rounds_per_chunk * config.num_envs
+            raise ValueError(
+                f"total_episodes is {config.total_episodes}, expected at least the {episodes} that "
+                f"the run in {folder.path} has behind it"
+            )
+        print(f"resuming after {chunks} of {config.num_chunks} chunks")
+        _compare_makes(told, mesh)
+        if config.method == "r2d2" and runner.memory is None:
+            print("saved without the replay: going on from an empty one, not exactly as before")
+            fresh = start_run(env_params, config, mesh)
+            runner = dataclasses.replace(runner, memory=fresh.memory)
+    else:
+        _require_none_lost(folder, config)
+        print("stopped before its first checkpoint: starting from the beginning")
+    folder.write_config(config)
+    folder.keep_metrics(chunks)
+    if chunks < config.num_chunks:
+        folder.unfinish()
+    rows = folder.read_metrics()
+    if [row["chunk"] for row in rows] != list(range(1, chunks + 1)):
+        warnings.warn(
+            f"{folder.path}: metrics.jsonl has {len(rows)} rows of {chunks} chunks", stacklevel=2
+        )
+    return runner
+
+
+def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
+    """Refuse to start from the beginning where there must have been checkpoints."""
+    place = folder.path / CHECKPOINTS
+    is_odd = os.path.lexists(place) and not place.is_dir()
+    if (
+        is_odd
+        or any(place.glob("*.damaged"))
+        or (folder.path / SUMMARY).exists()
+        or folder.train_seconds() > 120 * config.checkpoint_minutes
+    ):
+        raise ValueError(
+            f"{place}: holds no checkpoint that can be used, but the run has been further; put "
+            "them back, or start a new run in another folder"
+        )
+
+
+def _compare_makes(told: Manifest, mesh: Mesh | None) -> None:
+    """Say so where another machine or version goes on: the run is then not the same to the bit."""
+    count = 1 if mesh is None else mesh.size
+    then = {**told.contents["versions"], "device": told.contents["device"]}
+    now = {**manifest.versions(), "device": devices.words()}
+    then["devices"], now["devices"] = str(told.contents["num_devices"]), str(count)
+    changed = [name for name in ("jax", "device", "devices", "sqn_jax") if then[name] != now[name]]
+    if changed:
+        was = ", ".join(f"{name} {then[name]}" for name in changed)
+        is_now = ", ".join(f"{name} {now[name]}" for name in changed)
+        print(f"saved under {was}; going on under {is_now}: not bit for bit as it would have been")
+
+
+class _Training:
+    """Drives a training to its end, with everything that is written on the way."""
+
+    def __init__(
+        self,
+        env_params: EnvParams,
+        config: TrainConfig,
+        mesh: Mesh | None,
+        folder: RunFolder,
+        checkpoints: Checkpoints,
+        start: Policy | None,
+    ) -> None:
+        self._env_params, self._config, self._mesh = env_params, config, mesh
+        self._start = start
+        self._folder, self._checkpoints = folder, checkpoints
+        self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
+        self.timing: dict[str, float] = {
+            "train_seconds": folder.train_seconds(),
+            "env_steps": 0.0,
+            "num_devices": 1 if mesh is None else mesh.size,
+            "compile_seconds": 0.0,
+            "compiled_earlier": False,
+        }
+        self._successes: list[float] = []
+        self._saved_at = time.monotonic()
+
+    def drive(
+        self, runner: RunnerState | None, on_row: Callable[[dict[str, Any]], None] | None
+    ) -> RunnerState:
+        """From a state, or from the beginning, to the end; returns the final state."""
+        config = self._config
+        done = 0 if runner is None else _rounds_done(runner)
+        self.timing["env_steps"] = done * self._steps_a_round
+        if runner is not None and done >= config.num_rounds:
+            return runner
+        program = self._compile()
+        if runner is None:
+            runner = start_run(self._env_params, config, self._mesh)
+            if self._start is not None:
+                runner = started_from(runner, self._start)
+        total = config.num_rounds * config.num_envs
+        saving = "stopping after this chunk and saving"
+        with collected(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
+            for runner, report in run(runner, self._env_params, config, program, self._mesh):  # noqa: B020
+                row = self._keep(report)
+                if on_row is not None:
+                    on_row(row)
+                bar.set_postfix_str(_postfix(row), refresh=False)
+                bar.update(config.rounds_per_chunk * config.num_envs)
+                divergence.require_sound(row, runner.learner, config, self._folder)
+                is_due = time.monotonic() - self._saved_at > 60 * config.checkpoint_minutes
+                if received or is_due or report.chunk == config.num_chunks:
+                    self._save(report.chunk, runner)
+                if received:
+                    break
+        if received:
+            raise Interrupted(received[0])
+        return runner
+
+    def _compile(self) -> ChunkProgram:
+        """Compile, and refuse what does not fit."""
+        print("compiling ...", end="", flush=True)
+        with watched_compilation() as was_read:
+            program, seconds = compile_chunk(self._env_params, self._config, self._mesh)
+        self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
+        how = "compiled earlier, read" if was_read() else "compiled"
+        print(f"\r{how} in {seconds:.1f} s")
+        needed = memory_budget.program_bytes(program)
+        memory_budget.require(needed, "training", self._config.method)
+        return program
+
+    def _keep(self, report: ChunkReport) -> dict[str, Any]:
+        """Count a chunk and write its row."""
+        self.timing["train_seconds"] += report.seconds
+        self.timing["env_steps"] += self._config.rounds_per_chunk * self._steps_a_round
+        self._successes.append(float(np.mean(report.metrics["success"])))
+        row = _row(report, self.timing["train_seconds"], self._env_params, self._config)
+        self._folder.append_metrics(row)
+        return row
+
+    def _save(self, chunk: int, runner: RunnerState) -> None:
+        """Write a checkpoint, and what its rows say for good."""
+        self._folder.flush_metrics()
+        score = float(np.mean(self._successes))
+        light = not self._config.checkpoint_replay
+        self._checkpoints.save(chunk, runner, score=score, light=light)
+        self._successes.clear()
+        self._saved_at = time.monotonic()
+
+
+def _rounds_done(runner: RunnerState) -> int:
+    return int(np.max(np.asarray(runner.round)))
+
+
+def _row(
+    report: ChunkReport, train_seconds: float, env_params: EnvParams, config: TrainConfig
+) -> dict[str, Any]:
+    """One line of metrics.jsonl."""
+    rounds = report.chunk * config.rounds_per_chunk
+    episodes = rounds * config.num_envs
+    steps = config.rounds_per_chunk * config.num_envs * config.num_seeds * env_params.max_steps
+    return {
+        "chunk": report.chunk,
+        "episodes": episodes,
+        "env_steps": episodes * env_params.max_steps,
+        "wall_seconds": round(train_seconds, 3),
+        "steps_per_second": round(steps / report.seconds),
+        **report.metrics,
+    }
+
+
+def _postfix(row: dict[str, Any]) -> str:
+    return (
+        f"success {np.mean(row['success']):.2f}, reward {np.mean(row['mean_reward']):+.2f}, "
+        f"{row['steps_per_second']:,} steps/s"
+    )

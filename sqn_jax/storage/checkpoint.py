@@ -1,0 +1,333 @@
+"""Saving and loading the state of a run with Orbax.
+
+A checkpoint holds the whole `RunnerState`: parameters, optimiser, replay, keys and the round, and a
+manifest (`manifest.py`) that is compared with it before anything is used. The parameters of the
+policy stand apart, so that it can be loaded without the rest; so does the replay, which can be left
+out.
+
+A step is written under a hidden name and renamed once all of it is on the disk.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shutil
+import warnings
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+from jax.sharding import SingleDeviceSharding
+
+from sqn_jax.agent.learner import LearnerState
+from sqn_jax.agent.networks import Params
+from sqn_jax.storage import manifest
+from sqn_jax.storage.files import flush_to_disk
+from sqn_jax.storage.manifest import Damaged, Manifest, Mismatch, Origin
+from sqn_jax.storage.run_folder import CHECKPOINTS
+from sqn_jax.training.loop import RunnerState
+
+KEPT = 2
+"""How many of the newest are kept; the best one besides."""
+
+OVERHEAD_BYTES = 2**21
+"""What a checkpoint takes besides its arrays, at most: some fifty small files, and the manifest."""
+
+# Orbax reports every file it touches; a user wants to see the progress of the training.
+logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+class NotSaved(OSError):
+    """A checkpoint could not be written; the older ones are as they were."""
+
+
+class Checkpoints:
+    """The checkpoints of one run folder; use as a context manager."""
+
+    def __init__(self, run_dir: Path, origin: Origin) -> None:
+        self._folder = (run_dir / CHECKPOINTS).absolute()
+        self._origin = origin
+        self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._orbax.close()
+
+    def chunks(self) -> list[int]:
+        """Chunks done at each checkpoint, the oldest first."""
+        if not self._folder.is_dir():
+            return []
+        names = [path.name for path in self._folder.iterdir() if path.is_dir()]
+        return sorted(int(name) for name in names if name.isascii() and name.isdigit())
+
+    def save(
+        self, chunk: int, runner: RunnerState, *, score: float | None = None, light: bool = False
+    ) -> None:
+        """Write the state after `chunk` chunks; on the disk when this returns.
+
+        Args:
+            chunk: chunks done.
+            runner: the state.
+            score: success in training since the checkpoint before; the best one is kept.
+            light: leave out the replay, where there is one.
+
+        Raises:
+            NotSaved: the disk is full, say.
+        """
+        items = _split(runner)
+        exact = not (light and "memory" in items)
+        if not exact:
+            del items["memory"]
+        partial = self._folder / f".{chunk}.partial"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._sweep()
+            _require_space(self._folder, items)
+            told = {name: ocp.args.StandardSave(item) for name, item in items.items()}
+            self._orbax.save(partial, args=ocp.args.Composite(**told))
+            manifest.write(partial, items, self._origin, chunk=chunk, score=score, exact=exact)
+            self._set_aside(chunk)
+            partial.rename(self._place(chunk))
+            _flush_folder(self._folder)
+        except Exception as error:  # Orbax raises what its file library does.
+            self._sweep()
+            raise NotSaved(self._not_saved(chunk, error)) from None
+        self._prune()
+
+    def restore(self, runner_shapes: RunnerState) -> tuple[RunnerState, Manifest]:
+        """Load the newest sound checkpoint into a state of the given shapes (arrays or structs).
+
+        Newer ones that are damaged are named in a warning and set aside. The state has no replay
+        where the checkpoint was saved without.
+
+        Raises:
+            ValueError: there is no checkpoint, or none that is sound.
+            Mismatch: it is of another run.
+        """
+        faults = []
+        for chunk in reversed(self._require_some()):
+            try:
+                told = manifest.read(self._place(chunk), chunk)
+            except Damaged as error:
+                faults.append((chunk, f"checkpoint {self._place(chunk)}: damaged, {error}"))
+                continue
+            items = _split(runner_shapes)
+            if not told.is_exact:
+                items.pop("memory", None)
+            restored = self._restored(chunk, told, items)
+            for damaged, fault in faults:
+                warnings.warn(f"{fault}; going on from chunk {chunk}", UserWarning, stacklevel=2)
+                self._set_aside(damaged)
+            return _join(restored), told
+        raise ValueError("; ".join(fault for _, fault in faults))
+
+    def restore_policy(
+        self, params_shapes: Params, *, averaged: bool, which: int | str = "newest"
+    ) -> Params:
+        """Load only the parameters to evaluate.
+
+        Args:
+            params_shapes: the parameters as arrays or structs.
+            averaged: whether the run's policy is the average of its parameters, see
+                `loop.averages`.
+            which: "newest", "best" (by success in training) or a number of chunks.
+
+        Raises:
+            ValueError: there is no such checkpoint, or it is damaged.
+            Mismatch: it is of another run.
+        """
+        chunk = self._chosen(which)
+        name = "target_params" if averaged else "params"
+        try:
+            found = manifest.read(self._place(chunk), chunk, (name,))
+        except Damaged as error:
+            told = f"checkpoint {self._place(chunk)}: damaged, {error}"
+            older = [each for each in self.chunks() if each < chunk and self._is_sound(each)]
+            if older:
+                told += f"; that of chunk {older[-1]} is sound: --resume goes on from it, "
+                told += f"--checkpoint {older[-1]} takes it"
+            raise ValueError(told) from None
+        return self._restored(chunk, found, {name: params_shapes})[name]
+
+    def _chosen(self, which: int | str) -> int:
+        chunks = self._require_some()
+        if which == "newest":
+            return chunks[-1]
+        if which == "best":
+            return self._best(chunks) or chunks[-1]
+        if which in chunks:
+            return int(which)
+        known = ", ".join(str(chunk) for chunk in chunks)
+        raise ValueError(f"{self._folder}: no checkpoint {which}, expected newest, best or {known}")
+
+    def _restored(self, chunk: int, told: Manifest, shapes: dict[str, Any]) -> Any:
+        """Trees of the given shapes; on the first device where these do not name any.
+
+        Wherever the arrays lay when they were saved: a run on two devices goes on on one.
+        """
+        place = self._place(chunk)
+        rows = manifest.differences(told, self._origin, shapes)
+        if rows:
+            raise Mismatch(f"checkpoint {place}: not of this run as it is set up here", rows)
+        items = {name: ocp.args.StandardRestore(_placed(item)) for name, item in shapes.items()}
+        try:
+            restored = self._orbax.restore(place, args=ocp.args.Composite(**items))
+        except Exception as error:  # Not damage: every file is what was written.
+            reason = " ".join(str(error).split())[:200]
+            raise ValueError(
+                f"checkpoint {place}: cannot be restored ({type(error).__name__}: {reason})"
+            ) from None
+        wrong = manifest.wrong_leaf(told, {name: restored[name] for name in shapes})
+        if wrong is not None:
+            raise ValueError(f"checkpoint {place}: {wrong} was restored with other numbers")
+        return restored
+
+    def _require_some(self) -> list[int]:
+        chunks = self.chunks()
+        if not chunks:
+            raise ValueError(f"{self._folder}: holds no checkpoint")
+        return chunks
+
+    def _place(self, chunk: int) -> Path:
+        return self._folder / str(chunk)
+
+    def _is_sound(self, chunk: int) -> bool:
+        try:
+            manifest.read(self._place(chunk), chunk)
+        except ValueError:
+            return False
+        return True
+
+    def _best(self, chunks: Collection[int]) -> int | None:
+        """The one with most success in training, the newer of two alike."""
+        scores = []
+        for chunk in chunks:
+            with suppress(ValueError):  # What is damaged cannot be the best.
+                score = manifest.read(self._place(chunk), chunk, ()).score
+                if score is not None:
+                    scores.append((score, chunk))
+        return max(scores)[1] if scores else None
+
+    def _prune(self) -> None:
+        """Delete all but the newest ones and the best."""
+        chunks = self.chunks()
+        kept = {*chunks[-KEPT:], self._best(chunks)}
+        for chunk in chunks:
+            if chunk not in kept:
+                gone = self._place(chunk).with_name(f".{chunk}.old")
+                with suppress(OSError):
+                    self._place(chunk).rename(gone)
+        self._sweep()
+
+    def _sweep(self) -> None:
+        """Delete what was broken off."""
+        for pattern in (".*.partial*", ".*.old"):
+            for path in self._folder.glob(pattern):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _set_aside(self, chunk: int) -> None:
+        """Make room where a checkpoint stands that is of no use; it can be looked at still."""
+        place = self._place(chunk)
+        if place.exists():
+            aside = place.with_name(f"{chunk}.damaged")
+            shutil.rmtree(aside, ignore_errors=True)
+            place.rename(aside)
+
+    def _not_saved(self, chunk: int, error: Exception) -> str:
+        chunks = self.chunks()
+        left = f"that of chunk {chunks[-1]} is on the disk" if chunks else "there is no older one"
+        return f"checkpoint {self._place(chunk)}: cannot be written ({_reason(error)}); {left}"
+
+
+def _require_space(folder: Path, items: dict[str, Any]) -> None:
+    """Refuse to begin what a disk has no room for.
+
+    Orbax's file library goes on writing in threads of its own after a write has failed, and each
+    of them prints a traceback.
+    """
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items)) + OVERHEAD_BYTES
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC,
+            f"{os.strerror(errno.ENOSPC)}: {free / 1e6:,.1f} MB free, {needed / 1e6:,.1f} needed",
+        )
+
+
+def _reason(error: Exception) -> str:
+    """What the system said, out of the long story of a library."""
+    told = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
+        if os.strerror(number) in told:
+            return os.strerror(number)
+    return told[:200] or type(error).__name__
+
+
+def _flush_folder(folder: Path) -> None:
+    """Let a renaming survive a power cut."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            flush_to_disk(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _split(runner: RunnerState) -> dict[str, Any]:
+    """Parameters, their slow copy, replay, and all else as plain trees; keys as raw numbers."""
+    items = {
+        "params": runner.learner.params,
+        "target_params": runner.learner.target_params,
+        "memory": runner.memory,
+        "rest": {
+            "opt_state": runner.learner.opt_state,
+            "num_updates": runner.learner.num_updates,
+            "num_skipped": runner.learner.num_skipped,
+            "key": _key_data(runner.key),
+            "round": runner.round,
+        },
+    }
+    return {name: item for name, item in items.items() if item is not None}
+
+
+def _placed(shapes: Any) -> Any:
+    first = SingleDeviceSharding(jax.devices()[0])
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(
+            x.shape, x.dtype, sharding=getattr(x, "sharding", None) or first
+        ),
+        shapes,
+    )
+
+
+def _key_data(key: Any) -> Any:
+    if isinstance(key, jax.ShapeDtypeStruct):
+        return jax.eval_shape(jax.random.key_data, key)
+    return jax.random.key_data(key)
+
+
+def _join(items: Any) -> RunnerState:
+    rest = items["rest"]
+    held = {name: items[name] for name in items.keys()}  # noqa: SIM118, it is no dict.
+    learner = LearnerState(
+        params=items["params"],
+        target_params=held.get("target_params"),
+        opt_state=rest["opt_state"],
+        num_updates=rest["num_updates"],
+        num_skipped=rest["num_skipped"],
+    )
+    return RunnerState(
+        learner=learner,
+        memory=held.get("memory"),
+        key=jax.random.wrap_key_data(rest["key"]),
+        round=rest["round"],
+    )

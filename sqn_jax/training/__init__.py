@@ -1,0 +1,1 @@
+"""Rollouts and learning in one compiled program."""

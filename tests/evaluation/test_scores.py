@@ -1,0 +1,155 @@
+"""Scores worked out by hand from a few made-up episodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sqn_jax.evaluation.scores import (
+    Outcome,
+    describe,
+    improvement,
+    markdown_table,
+    records,
+    results_table,
+)
+from sqn_jax.training.rollout import EpisodeSummary
+
+
+def outcome(
+    training_seed: int | None, eval_seed: int, success: list[bool], **changes: Any
+) -> Outcome:
+    count = len(success)
+    reached = np.array(success)
+    fields = {
+        "success": reached,
+        "time_steps": np.where(reached, 10 * (1 + np.arange(count)), 400),
+        "mean_reward": np.arange(count) / 4,
+        "collisions": np.arange(count),
+        "covered_area": np.full(count, 7.0),
+        "path_length": np.full(count, 8.0),
+        **changes,
+    }
+    starts, goals = np.zeros((count, 3)), np.ones((count, 2))
+    shortest = np.full(count, 6.0)
+    return Outcome(training_seed, eval_seed, EpisodeSummary(**fields), starts, goals, shortest)
+
+
+def test_failures_count_at_the_limit_and_are_left_out_of_the_successes() -> None:
+    told = describe([outcome(0, 1000, [True, False, True, True])])
+    assert told["success"]["mean"] == 0.75
+    assert told["time_steps"]["mean"] == (10 + 400 + 30 + 40) / 4
+    assert told["time_steps_success"]["mean"] == (10 + 30 + 40) / 3
+    assert told["spl"]["mean"] == pytest.approx(3 / 4 * 6 / 8)
+    assert told["collisions"]["mean"] == 1.5
+    assert told["coverage_m2"]["mean"] == 7.0
+    assert told["success_per_seed"] == [0.75]
+    assert "iqm" not in told["success"], "one training seed has no spread over training seeds"
+
+
+def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> None:
+    """Evaluation seeds are told apart, training seeds meet the same oracle."""
+    ours = [
+        outcome(0, 1000, [True, False, True, True]),
+        outcome(1, 1000, [True, True, False, False]),
+        outcome(0, 1001, [True, True, False, False]),
+    ]
+    oracle = [
+        outcome(None, 1001, [True, False, True, True], time_steps=np.array([8, 400, 9, 9])),
+        outcome(None, 1000, [True, True, True, True], time_steps=np.array([5, 10, 20, 40])),
+    ]
+    told = describe(ours, oracle)["steps_over_oracle"]
+    expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
+    assert told["mean"] == pytest.approx(np.mean(expected))
+    assert told["std"] == pytest.approx(np.std(expected))
+    assert describe(ours)["steps_over_oracle"] is None
+    nowhere = outcome(0, 1000, [False] * 4)
+    assert describe([nowhere], oracle)["steps_over_oracle"] is None
+
+
+def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> None:
+    told = describe(
+        [outcome(0, 1000, [True, True, True, True]), outcome(0, 1001, [True, False, False, True])]
+    )
+    assert told["success"]["mean"] == 0.75
+    assert told["success"]["std_of_means"] == 0.25
+    assert told["success"]["std"] == pytest.approx(np.sqrt(0.75 * 0.25))
+
+
+def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
+    rates = ([True, True], [True, False], [False, False], [True, True])
+    told = describe([outcome(seed, 1000, rate) for seed, rate in enumerate(rates)])
+    assert told["success_per_seed"] == [1.0, 0.5, 0.0, 1.0]
+    assert told["success"]["iqm"] == pytest.approx((0.5 + 1.0) / 2)
+    low, high = told["success"]["iqm_ci95"]
+    assert 0 <= low < 0.75 < high <= 1
+
+
+def test_no_success_and_no_shortest_way_are_said_and_not_made_up() -> None:
+    lost = outcome(None, 1000, [False, False])
+    blind = Outcome(None, 1000, lost.summary, lost.starts, lost.goals, None)
+    told = describe([blind])
+    assert told["time_steps_success"] is None
+    assert told["spl"] is None
+
+
+def test_improvement_needs_several_training_seeds_of_both() -> None:
+    good = [[outcome(seed, 1000, [True, True]) for seed in range(3)]]
+    bad = [[outcome(seed, 1000, [seed == 0, False]) for seed in range(3)]]
+    told = improvement(good, bad)
+    assert told["probability"] == 1.0
+    assert improvement(bad, good)["probability"] == 0.0
+    assert improvement(good, good)["probability"] == 0.5
+    assert improvement(good, [[outcome(None, 1000, [True, True])]]) is None
+
+
+def test_a_record_says_what_an_episode_was_and_came_to() -> None:
+    rows = list(records([outcome(3, 1001, [False, True])], map="maze", agent="sqn"))
+    assert len(rows) == 2
+    assert rows[1] == {
+        "map": "maze",
+        "agent": "sqn",
+        "training_seed": 3,
+        "eval_seed": 1001,
+        "episode": 1,
+        "start": [0.0, 0.0, 0.0],
+        "goal": [1.0, 1.0],
+        "success": True,
+        "time_steps": 20,
+        "collisions": 1,
+        "mean_reward": 0.25,
+        "coverage_m2": 7.0,
+        "path_length_m": 8.0,
+        "spl": 0.75,
+    }
+
+
+def test_a_markdown_table_is_one() -> None:
+    table = markdown_table(["a", "long"], [["x", "1"], ["yyy", "22"]])
+    assert table == "| a   | long |\n|-----|------|\n| x   | 1    |\n| yyy | 22   |"
+
+
+def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> None:
+    entries = []
+    for noise in (0.0, 0.2):
+        for radius, success in ((0.3, [True, False]), (0.5, [True, True])):
+            entries.append(
+                {
+                    **{"map": "maze", "agent": "sqn", "tasks": "evaluation points"},
+                    **{"velocity_noise": noise, "range_noise": 0.0, "goal_radius": radius},
+                    **describe([outcome(0, 1000, success)]),
+                }
+            )
+    header, _, quiet, noisy = results_table(entries).splitlines()
+    assert "success 0.3 m" in header
+    assert "success 0.5 m" in header
+    assert [cell.strip() for cell in quiet.split("|")[1:6]] == [
+        "maze",
+        "sqn",
+        "none",
+        "0.50 ± 0.00",
+        "1.00",
+    ]
+    assert "velocity 0.2" in noisy

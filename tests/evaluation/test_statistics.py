@@ -1,0 +1,94 @@
+"""Intervals against textbook numbers and SciPy's own bootstrap."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sqn_jax.evaluation.statistics import (
+    bootstrap_interval,
+    interquartile_mean,
+    probability_of_improvement,
+    stratified_bootstrap,
+    success_weighted_path_length,
+    wilson_interval,
+)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 20), (19, 20), (20, 20), (81, 263)])
+def test_the_wilson_interval_solves_its_quadratic(successes: int, trials: int) -> None:
+    z = 1.959963984540054
+    rate = successes / trials
+    centre = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
+    inner = rate * (1 - rate) / trials + z * z / (4 * trials * trials)
+    half = z * math.sqrt(inner) / (1 + z * z / trials)
+    low, high = wilson_interval(successes, trials)
+    assert low == pytest.approx(centre - half, abs=1e-9)
+    assert high == pytest.approx(centre + half, abs=1e-9)
+
+
+def test_the_bootstrap_interval_is_near_that_of_scipy() -> None:
+    values = np.random.default_rng(3).gamma(2.0, 50.0, size=200)
+    theirs = stats.bootstrap((values,), np.mean, method="percentile", rng=7).confidence_interval
+    low, high = bootstrap_interval(values)
+    assert low == pytest.approx(theirs.low, rel=0.02)
+    assert high == pytest.approx(theirs.high, rel=0.02)
+
+
+def test_one_value_has_an_interval_of_no_width() -> None:
+    assert bootstrap_interval([3.5]) == (3.5, 3.5)
+
+
+def test_nothing_has_no_interval() -> None:
+    with pytest.raises(ValueError, match="at least one value"):
+        bootstrap_interval([])
+    with pytest.raises(ValueError, match="at least one trial"):
+        wilson_interval(0, 0)
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
+    assert interquartile_mean([100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, -90.0]) == pytest.approx(3.5)
+    # Five values: one and a quarter rounds down to one at each end.
+    assert interquartile_mean([9.0, 0.0, 1.0, 2.0, 3.0]) == pytest.approx(2.0)
+    assert interquartile_mean([0.4, 0.8]) == pytest.approx(0.6)
+
+
+def test_the_probability_of_improvement_counts_pairs_and_halves_ties() -> None:
+    rng = np.random.default_rng(5)
+    ours, theirs = rng.integers(0, 4, (6, 2)), rng.integers(0, 4, (4, 2))
+    count = 0.0
+    for task in range(2):
+        for one in ours[:, task]:
+            for other in theirs[:, task]:
+                count += 1.0 if one > other else 0.5 if one == other else 0.0
+    assert probability_of_improvement(ours, theirs) == pytest.approx(count / (2 * 6 * 4))
+    # One task: Mann and Whitney's U over the number of pairs.
+    u = stats.mannwhitneyu(ours[:, 0], theirs[:, 0]).statistic
+    assert probability_of_improvement(ours[:, 0], theirs[:, 0]) == pytest.approx(u / 24)
+
+
+def test_the_stratified_bootstrap_of_a_mean_is_near_that_of_scipy() -> None:
+    values = np.random.default_rng(6).normal(10.0, 3.0, size=30)
+    theirs = stats.bootstrap((values,), np.mean, method="percentile", rng=8).confidence_interval
+    low, high = stratified_bootstrap([values], lambda x: float(x.mean()))
+    assert low == pytest.approx(theirs.low, rel=0.02)
+    assert high == pytest.approx(theirs.high, rel=0.02)
+
+
+def test_the_bootstrap_draws_runs_within_each_task() -> None:
+    # Were values drawn across tasks, the mean of the first column would not stay 0.
+    scores = np.stack([np.zeros(5), np.arange(5.0)], axis=1)
+    low, high = stratified_bootstrap([scores], lambda x: float(x[:, 0].mean()))
+    assert (low, high) == (0.0, 0.0)
+    low, high = stratified_bootstrap([scores], lambda x: float(x[:, 1].mean()))
+    assert low < 2.0 < high
+
+
+def test_spl_by_hand() -> None:
+    spl = success_weighted_path_length(
+        [True, True, False, True, True], [10.0, 4.0, 5.0, 20.0, 0.0], [5.0, 5.0, 5.0, 20.0, 0.0]
+    )
+    np.testing.assert_allclose(spl, [0.5, 1.0, 0.0, 1.0, 1.0])

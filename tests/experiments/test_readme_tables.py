@@ -1,0 +1,81 @@
+"""The README's tables: they say what the recorded files say, and nothing else is touched."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import common, readme_tables
+from experiments.readme_tables import TABLES, filled
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def entry(agent: str, name: str, scores: list[float], **changes: Any) -> dict[str, Any]:
+    mean = sum(scores) / len(scores)
+    return {
+        **{"agent": agent, "map": name, "tasks": "evaluation points", "goal_radius": 0.3},
+        **{"velocity_noise": 0.0, "range_noise": 0.0, "training_seeds": list(range(len(scores)))},
+        **{"success": {"mean": mean}, "time_steps": {"mean": 123.4}, "success_per_seed": scores},
+        **{"steps_over_oracle": {"mean": 1.234}, "spl": {"mean": 0.5}, **changes},
+    }
+
+
+def write(folder: Path, name: str, results: list[Any], comparisons: list[Any]) -> None:
+    told = {"schema": 1, "results": results, "comparisons": comparisons}
+    (folder / name).write_text(json.dumps(told), encoding="utf-8")
+
+
+def test_the_readme_says_what_the_records_say() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert filled(text) == text
+    for name in TABLES:
+        assert f"<!-- table {name} -->" in text
+
+
+def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """0.8 and 1.0 are 0.9 on average, 0.1 apart from it; other radii and noise are not mixed in."""
+    maps = ("maze", "column", "forest", "cave")
+    results = [entry("sqn", name, [0.8, 1.0]) for name in maps]
+    results += [entry("r2d2", name, [0.5]) for name in maps]
+    results += [entry("sqn", "maze", [0.0, 0.0], goal_radius=0.5)]
+    results += [entry("sqn", "maze", [0.0, 0.0], velocity_noise=0.1)]
+    told = {"first": "sqn", "second": "r2d2", "probability": 1.0, "ci95": [0.5, 1.0]}
+    back = {"first": "r2d2", "second": "sqn", "probability": 0.0, "ci95": [0.0, 0.5]}
+    write(tmp_path, "seeds_table.json", results, [told, back])
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    lines = readme_tables.seeds().splitlines()
+    assert [cell.strip() for cell in lines[2].split("|")[1:-1]] == [
+        "SQN, 2 seeds",
+        *["0.90 ± 0.10"] * 4,
+    ]
+    assert lines[3].startswith("| R2D2, 1 seed ")
+    assert lines[-1] == "SQN beats R2D2 with probability 1.00 [0.50, 1.00]."
+
+
+def test_policies_stand_beside_the_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = ("maze", "column", "forest", "cave")
+    agents = ("sqn best", "sqn sqn", "r2d2", "dqn", "bug", "oracle")
+    results = [entry(a, m, [0.957]) for a in agents for m in maps]
+    results[3]["steps_over_oracle"] = None
+    write(tmp_path, "pretrained_table.json", results, [])
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    table = readme_tables.policies().splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
+    assert cells[0] == ["", *maps]
+    assert cells[2] == ["`pretrained:best`", *["0.96, 123 (1.23)"] * 3, "0.96, 123"]
+    assert cells[7][1] == "0.96, 123", "the oracle is not held against itself"
+    assert cells[8] == ["paper, SQN", "0.98, 181", "0.99, 149", "0.93, 171", "0.82, 768"]
+
+
+def test_only_what_is_between_the_marks_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TABLES, "seeds", lambda: r"| \1 new |")
+    page = "before\n<!-- table seeds -->\n| old |\n<!-- end -->\nafter <!-- end -->\n"
+    assert filled(page) == page.replace("| old |", r"| \1 new |")
+    with pytest.raises(ValueError, match="table nonsense: none of this name"):
+        filled("<!-- table nonsense -->\n<!-- end -->")
+    with pytest.raises(ValueError, match="table seeds: 0 of them with an end"):
+        filled("<!-- table seeds -->\n")

@@ -1,0 +1,82 @@
+"""A run that starts from a trained policy has its parameters, and only one it can take."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from tiny_runs import TinyRuns
+
+from sqn_jax.policies.run_policies import load_policy
+
+same = partial(np.testing.assert_allclose, rtol=0, atol=1e-20)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> TinyRuns:
+    runs = TinyRuns(tmp_path_factory.mktemp("runs"), chunks=2)
+    code, _, err = runs.call("first")
+    assert code == 0, err
+    return runs
+
+
+def test_a_run_starts_where_the_other_ended(
+    runs: TinyRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With steps too small to count it ends there, too, whatever its own seed; for every seed of
+    several, and named by a path from where it was started."""
+    monkeypatch.chdir(runs.folder)
+    still = ["--seed", "5", "--learner.learning-rate", "1e-30", "--start-from", "first"]
+    code, out, err = runs.call("second", *still, "--num-seeds", "2")
+    assert code == 0, err
+    assert f"starting from {runs.folder / 'first'}" in out
+    (expected,) = load_policy(runs.folder / "first").params
+    for found in load_policy(runs.folder / "second").params:
+        jax.tree.map(same, found, expected)
+    monkeypatch.chdir("/")
+    code, out, err = runs.call("second", "--total-episodes", "12", resume=True)
+    assert code == 0, err
+    jax.tree.map(same, load_policy(runs.folder / "second").params[1], expected)
+
+
+def test_it_learns_on_from_there(runs: TinyRuns) -> None:
+    code, _, err = runs.call("third", "--start-from", str(runs.folder / "first"))
+    assert code == 0, err
+    (before,) = load_policy(runs.folder / "first").params
+    (after,) = load_policy(runs.folder / "third").params
+    moves = jax.tree.map(lambda x, y: float(np.abs(x - y).max()), before, after)
+    assert all(move > 0 for move in jax.tree.leaves(moves))
+    assert max(jax.tree.leaves(moves)) < 0.1  # A few updates, not another beginning.
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--algo", "r2d2"], "its algo is sqn, here it is r2d2"),
+        (
+            ["--network.hidden-size", "16"],
+            "its network.hidden_size is 8, here it is 16 (--network.hidden-size)",
+        ),
+        (["--env.num-beams", "31"], "its env.num_beams is 71, here it is 31"),
+        (["--env.heading-encoding", "sincos"], "its env.heading_encoding is linear, here"),
+    ],
+)
+def test_another_network_is_refused_before_anything_is_written(
+    words: list[str], told: str, runs: TinyRuns
+) -> None:
+    code, _, err = runs.call("refused", *words, "--start-from", str(runs.folder / "first"))
+    assert code == 2
+    assert told in err
+    assert err.count("\n") == 1
+    assert not Path(runs.folder / "refused").exists()
+
+
+def test_what_is_no_policy_is_refused(runs: TinyRuns) -> None:
+    for start, told in (("nowhere", "holds no run"), ("pretrained:nobody", "no such policy")):
+        code, _, err = runs.call("refused", "--start-from", start)
+        assert code == 2
+        assert told in err
+        assert not (runs.folder / "refused").exists()

@@ -1,0 +1,171 @@
+"""`sqn render` as a user meets it: what it writes, and what it says of words it cannot use."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compiling import compiling_quickly
+from PIL import Image
+from rooms import random_params, small_room, write_empty_room
+
+from sqn_jax.cli import main
+from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.policies import pretrained
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.report.render import agent_names, default_folder
+from sqn_jax.training.loop import network_of
+
+STEPS = 12
+BEAMS = 11  # Few compile sooner.
+TINY = TrainConfig(network=NetworkConfig(hidden_size=8), env=EnvConfig(num_beams=BEAMS))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two policies that were never trained."""
+    folder = tmp_path_factory.mktemp("weights")
+    room = small_room(STEPS, num_beams=BEAMS)
+    for seed, name in enumerate(("one", "two")):
+        params = random_params(network_of(TINY), room, seed)
+        pretrained.write_policy(folder, Policy(name, TINY, (params,)), {})
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _pretrained(monkeypatch: pytest.MonkeyPatch, weights: Path, tmp_path: Path) -> Iterator[None]:
+    monkeypatch.setattr(pretrained, "_folder", lambda: weights)
+    monkeypatch.chdir(tmp_path)
+    with compiling_quickly():
+        yield
+
+
+def test_every_agent_gets_its_films_and_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = write_empty_room(tmp_path)
+    words = ["pretrained:one", "pretrained:two", "--map", str(room), "--max-steps", str(STEPS)]
+    words += ["--episodes", "2", "--animations", "1", "--out", "deep/pictures"]
+    assert main(["render", *words]) == 0
+    written = sorted(path.name for path in Path("deep/pictures").iterdir())
+    assert written == [
+        "sqn_one_episode_1.gif",
+        "sqn_one_timeline_1.png",
+        "sqn_two_episode_1.gif",
+        "sqn_two_timeline_1.png",
+        "trajectories.png",
+    ]
+    told = capsys.readouterr().out.splitlines()
+    said = {line.split()[1] for line in told if line.startswith("wrote ")}
+    assert said == {f"deep/pictures/{name}" for name in written}
+    films = []
+    for agent in ("one", "two"):
+        with Image.open(f"deep/pictures/sqn_{agent}_episode_1.gif") as film:
+            assert film.n_frames <= STEPS + 1
+            films.append(np.asarray(film.convert("RGB")).astype(int))
+    same = np.abs(films[0] - films[1]).max(axis=-1) < 24
+    # Before the first step both stand in the same place and have the same goal: a room of 5 x 4 m
+    # fills 496 x 397 pixels. Their names differ.
+    assert same[94:488, 14:506].mean() > 0.999
+    assert not same[:40].all()
+
+
+def test_one_agent_writes_below_the_current_folder(tmp_path: Path) -> None:
+    room = write_empty_room(tmp_path)
+    words = ["pretrained:one", "--map", str(room), "--max-steps", str(STEPS)]
+    assert main(["render", *words, "--episodes", "2", "--animations", "0"]) == 0
+    written = sorted(path.name for path in (tmp_path / "renders" / "one_room").iterdir())
+    assert written == ["sqn_timeline_1.png", "trajectories.png"]
+
+
+def test_agents_of_one_network_are_told_apart_by_their_runs() -> None:
+    one, two, other = (
+        Policy(name, dataclasses.replace(TINY, algo=algo), ())
+        for name, algo in (("a", "sqn"), ("b", "sqn"), ("c", "dqn"))
+    )
+    assert list(agent_names([one, two, other])) == ["SQN a", "SQN b", "DQN"]
+    accented = [Policy(name, one.config, ()) for name in ("a/run", "\u00e9", "\u00e8", "a_run")]
+    names = list(agent_names(accented))
+    assert names == ["SQN a/run", "SQN \u00e9", "SQN \u00e8", "SQN a_run (2)"]
+    with pytest.raises(ValueError, match="6 policies to render, expected 1 to 5"):
+        agent_names([one] * 6)
+    several = Policy("s", dataclasses.replace(TINY, seed=7, num_seeds=2), (1, 2))
+    assert list(agent_names([several])) == ["SQN seed 7"]
+    assert default_folder([one], "maze") == Path("renders/a_maze")
+    assert default_folder([one, two, other], "my/maps/attic.yaml") == Path(
+        "renders/a_and_2_more_attic"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ([], ["name a run folder", "pretrained:NAME"]),
+        (["nowhere"], ["nowhere", "holds no run"]),
+        (["pretrained:three"], ["pretrained:three", "pretrained:one", "pretrained:two"]),
+        (["pretrained:one", "pretrained:one"], ["one", "twice"]),
+        (["pretrained:one", "--map", "nowhere"], ["nowhere", "maze"]),
+        (["pretrained:one", "--episodes", "0"], ["episodes", "0", "1 to 32"]),
+        (["pretrained:one", "--animations", "5"], ["animations", "5", "4 episodes"]),
+        (["pretrained:one", "--tasks", "all"], ["--tasks", "points", "pairs"]),
+        (["pretrained:one", "--range-noise", "-1"], ["noise", "-1"]),
+        (["pretrained:one", "--max-steps", "-1"], ["max_steps", "-1"]),
+        (["pretrained:one", "--out", ""], ["--out", "empty"]),
+        (["pretrained:one", "--out", "/proc/films"], ["/proc/films", "cannot be written"]),
+        (["pretrained:one", "--frames", "3"], ["--frames"]),
+    ],
+)
+def test_wrong_words_of_render_are_named_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: list[str], names: list[str]
+) -> None:
+    assert main(["render", *words]) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("sqn: ")
+    assert told.err.count("\n") == 1, told.err
+    for name in names:
+        assert name in told.err, (name, told.err)
+    assert told.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_in_the_place_of_the_folder_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "taken").touch()
+    assert main(["render", "pretrained:one", "--out", "taken"]) == 2
+    assert "folder taken: cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("missing", "extra"), [("matplotlib", "sqn_jax[viz]"), ("imageio_ffmpeg", "sqn_jax[video]")]
+)
+def test_a_missing_library_is_one_line_with_the_name_of_the_extra(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    missing: str,
+    extra: str,
+) -> None:
+    import sqn_jax
+
+    ours = ("sqn_jax.report.render", "sqn_jax.figures")
+    for module in [name for name in sys.modules if name.startswith((*ours, f"{missing}."))]:
+        monkeypatch.delitem(sys.modules, module)
+    for name in ("render", "figures"):
+        monkeypatch.delattr(sqn_jax, name, raising=False)
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert main(["render", "pretrained:one", "--mp4"]) == 2
+    told = capsys.readouterr().err
+    assert extra in told
+    assert told.count("\n") == 1, told
+
+
+def test_evaluate_takes_pretrained_policies_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "pretrained:three"]) == 2
+    assert "expected one of pretrained:one" in capsys.readouterr().err
+    # Found, and so it is the map that is at fault.
+    assert main(["evaluate", "pretrained:two", "--maps", "nowhere"]) == 2
+    assert capsys.readouterr().err.startswith("sqn: unknown map 'nowhere'")
