@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps import OccupancyMap, cells_to_points, save_map, validate
-from sqn_jax.maps.generate import KINDS, generate
+from sqn_jax.maps.generate import generate
 from sqn_jax.maps.terrain import (
     CAVE_SIZE,
     RESOLUTION,

@@ -99,7 +99,7 @@ def card(
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
-        "trained_on": Path(policy.config.map).stem,
+        "trained_on": policy.config.maps.stem,
         "went_on_from": earlier_runs(before),
         "training_episodes": last["episodes"],
         "averaged_with": (

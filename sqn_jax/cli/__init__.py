@@ -1,6 +1,6 @@
 """The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`.
 
-It wires words to functions, no more.
+It wires arguments to functions, no more.
 
 Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback),
 130, 143 and 129 stopped by SIGINT, SIGTERM or SIGHUP after saving.
@@ -34,10 +34,9 @@ USAGE = """usage: sqn COMMAND [OPTIONS]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with interruptible():
-            code = _dispatch(words)
+            code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
         sys.stdout.flush()
     except Interrupted as stop:
         say_stopped(stop.signal)
@@ -62,17 +61,18 @@ def run() -> NoReturn:
     sys.exit(code)
 
 
-def _dispatch(words: list[str]) -> int:
-    if not words or words[0] in ("-h", "--help"):
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE, end="")
-        return 0 if words else 2
-    command = _COMMANDS.get(words[0])
+        return 0 if arguments else 2
+    name, *of_command = arguments
+    command = _COMMANDS.get(name)
     if command is None:
-        return _refuse(f"unknown command {words[0]!r}, expected one of {', '.join(_COMMANDS)}")
+        return _refuse(f"unknown command {name!r}, expected one of {', '.join(_COMMANDS)}")
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
-            return command(words[1:])
+            return command(of_command)
     except SystemExit as stop:  # After a help text.
         return int(stop.code or 0)
     except BrokenPipeError:

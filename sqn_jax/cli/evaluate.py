@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sqn_jax.cli.words import CACHE, TASKS, Parser, add_checkpoint, add_device
+from sqn_jax.cli.arguments import (
+    CACHE,
+    TASKS,
+    Parser,
+    add_checkpoint,
+    add_device,
+    single_maps,
+)
 from sqn_jax.config.presets import PAPER_MAPS
 
 
-def evaluate(words: list[str]) -> int:
+def evaluate(arguments: list[str]) -> int:
     """Compare policies."""
     parser = Parser(
         prog="sqn evaluate",
@@ -37,12 +44,11 @@ def evaluate(words: list[str]) -> int:
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax.evaluation import compare
     from sqn_jax.evaluation.scores import results_table
-    from sqn_jax.maps import split_names
     from sqn_jax.policies.pretrained import find_policy
     from sqn_jax.runs.evaluate import evaluate_session
     from sqn_jax.training import devices
@@ -51,8 +57,8 @@ def evaluate(words: list[str]) -> int:
     noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
     noise += [(0.0, level) for level in options.range_noise if level != 0]
     settings = compare.Settings(
-        maps=tuple(name for word in options.maps for name in split_names(word)),
-        tasks=tuple(TASKS[word] for word in options.tasks),
+        maps=single_maps(options.maps),
+        tasks=tuple(TASKS[name] for name in options.tasks),
         episodes=options.episodes,
         eval_seeds=options.eval_seeds,
         seed=options.seed,
@@ -64,7 +70,7 @@ def evaluate(words: list[str]) -> int:
     if options.out is not None:
         _require_writable(options.out)
     learnt = compare.group_policies(
-        [find_policy(word, options.checkpoint) for word in options.runs]
+        [find_policy(name, options.checkpoint) for name in options.runs]
     )
     agents = compare.with_references(learnt, references=not options.no_references)
     evaluation = evaluate_session(agents, settings, options.out)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from sqn_jax.cli.words import Parser
+from sqn_jax.cli.arguments import Parser
+from sqn_jax.config.map_names import parse
 
 
-def check_map(words: list[str]) -> int:
+def check_map(arguments: list[str]) -> int:
     """Say what a map offers."""
     parser = Parser(prog="sqn map", description="Look at maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
@@ -16,11 +17,11 @@ def check_map(words: list[str]) -> int:
         action="store_true",
         help="let the YAML file name an image that lies outside its folder",
     )
-    options = parser.parse_args(words)
-    from sqn_jax.maps import load_map, split_names
+    options = parser.parse_args(arguments)
+    from sqn_jax.maps import load_map
     from sqn_jax.maps.check import describe
 
-    for number, name in enumerate(split_names(options.file)):
+    for number, name in enumerate(parse(options.file).names):
         occupancy_map = load_map(
             name, robot_radius=options.robot_radius, allow_outside=options.allow_outside
         )

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sqn_jax.cli.words import CACHE, TASKS, Parser, add_checkpoint, add_device, folder
+from sqn_jax.cli.arguments import (
+    CACHE,
+    TASKS,
+    Parser,
+    add_checkpoint,
+    add_device,
+    folder,
+    single_maps,
+)
 
 
-def report(words: list[str]) -> int:
+def report(arguments: list[str]) -> int:
     """Write a page."""
     parser = Parser(
         prog="sqn report",
@@ -27,7 +35,7 @@ def report(words: list[str]) -> int:
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=Path, default=Path("report.html"), help="default: report.html")
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     if not options.runs:
         raise ValueError("nothing to report on: name a run folder or pretrained:NAME")
     try:
@@ -37,17 +45,16 @@ def report(words: list[str]) -> int:
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
     from sqn_jax.evaluation.compare import Settings
-    from sqn_jax.maps import split_names
     from sqn_jax.training import devices
 
     devices.require(options.device)
     pages.require_writable(options.out)
     runs = pages.read_runs(options.runs, options.checkpoint)
     config = runs[0].policy.config
-    maps = options.maps or split_names(config.map)[:1]
+    maps = options.maps or [str(config.maps.names[0])]
     settings = Settings(
-        maps=tuple(name for word in maps for name in split_names(word)),
-        tasks=tuple(TASKS[word] for word in options.tasks),
+        maps=single_maps(maps),
+        tasks=tuple(TASKS[name] for name in options.tasks),
         episodes=options.episodes,
         eval_seeds=options.eval_seeds,
         seed=options.seed,
@@ -58,7 +65,7 @@ def report(words: list[str]) -> int:
     return 0
 
 
-def render(words: list[str]) -> int:
+def render(arguments: list[str]) -> int:
     """Write pictures and films."""
     parser = Parser(
         prog="sqn render",
@@ -81,7 +88,7 @@ def render(words: list[str]) -> int:
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=folder, metavar="DIR", help="default: renders/NAME_MAP, NAME the run's")
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     if not options.runs:
         raise ValueError("nothing to render: name a run folder or pretrained:NAME")
     from sqn_jax.policies.pretrained import find_policy
@@ -94,10 +101,10 @@ def render(words: list[str]) -> int:
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
     devices.require(options.device)
-    for word in options.runs:
-        if options.runs.count(word) > 1:
-            raise ValueError(f"{word}: comes twice, expected each run once")
-    policies = [find_policy(word, options.checkpoint) for word in options.runs]
+    for name in options.runs:
+        if options.runs.count(name) > 1:
+            raise ValueError(f"{name}: comes twice, expected each run once")
+    policies = [find_policy(name, options.checkpoint) for name in options.runs]
     pictures.render_session(
         policies,
         options.out or pictures.default_folder(policies, options.map),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -15,6 +16,7 @@ from sqn_jax.config.groups import (
     RandomizationConfig,
     ReplayConfig,
 )
+from sqn_jax.config.map_names import MapSet, parse
 from sqn_jax.config.validation import (
     require,
     require_known_words,
@@ -36,7 +38,8 @@ class TrainConfig:
     """How it learns: R2D2 with replay, or recurrent PQN on fresh episodes."""
     map: str = "maze"
     """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
-    ("maze:7"), or several side by side, "maze,maze:0-14"; evaluated is the first."""
+    ("maze:7"), or several side by side, "maze*8,maze:0-14", here with eight times as many tasks on
+    the first; evaluated is the first."""
     start_from: str = ""
     """A trained policy to start from in place of random parameters: a run folder,
     "pretrained:sqn" or a file NAME.npz. Its network and sensors must be those of this run."""
@@ -68,6 +71,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_known_words(self, "")
+        # Equal maps are equal settings, however they were written.
+        object.__setattr__(self, "map", str(self.maps))
         require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")
         for name in ("num_seeds", "num_envs", "updates_per_round", "rounds_per_chunk"):
             value = getattr(self, name)
@@ -96,6 +101,11 @@ class TrainConfig:
                 self.learner.batch_size,
                 f"a divisor of num_envs ({self.num_envs}) under the method pqn",
             )
+
+    @functools.cached_property
+    def maps(self) -> MapSet:
+        """The maps that `map` names."""
+        return parse(self.map)
 
     @property
     def num_rounds(self) -> int:

@@ -2,7 +2,7 @@
 
 from sqn_jax.maps.check import describe
 from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
-from sqn_jax.maps.names import load_map, split_names, weighted_names
+from sqn_jax.maps.load import load_map
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -29,8 +29,6 @@ __all__ = [
     "reachable_cells",
     "sample_spawn_points",
     "save_map",
-    "split_names",
     "traversable",
     "validate",
-    "weighted_names",
 ]

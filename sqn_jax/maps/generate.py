@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps.occupancy import OccupancyMap, cells_to_points
 from sqn_jax.maps.terrain import (
     CAVE_SIZE,
@@ -34,8 +35,6 @@ from sqn_jax.maps.terrain import (
     wall_edges,
     walled_square,
 )
-
-KINDS = ("maze", "column", "forest", "cave")
 
 _GAP = 0.7  # m, at least, between two obstacles in the open
 _TRIES = 400  # places tried for obstacles in the open

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from sqn_jax import figures
 from sqn_jax.config import EnvConfig
+from sqn_jax.config.map_names import parse
 from sqn_jax.evaluation.compare import Learnt, Settings, Tasks, World, load_maps, robot_for, worlds
 from sqn_jax.evaluation.recording import Episode, record_world
 from sqn_jax.figures import animation
@@ -130,7 +131,7 @@ def default_folder(policies: Sequence[Policy], map_name: str) -> Path:
     name = policies[0].name
     if len(policies) > 1:
         name += f"_and_{len(policies) - 1}_more"
-    return Path("renders") / f"{name}_{Path(map_name).stem}"
+    return Path("renders") / f"{name}_{parse(map_name).stem}"
 
 
 def _file_name(agent: str) -> str:

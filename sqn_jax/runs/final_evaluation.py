@@ -9,7 +9,7 @@ import jax
 import sqn_jax
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
-from sqn_jax.maps import OccupancyMap, split_names
+from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices
@@ -31,7 +31,7 @@ def evaluate(
         config: of the run.
         folder: of the run.
     """
-    name = split_names(config.map)[0]
+    name = str(config.maps.names[0])
     # On one device: every program that is given them would else run on each of the mesh.
     params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
     policy = Policy(folder.path.name, config, seeds_of(params, config))
@@ -70,7 +70,7 @@ def draw(drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder:
         print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
         return False
     name = f"{config.algo.upper()} on {occupancy_map.name}"
-    if (count := len(split_names(config.map))) > 1:
+    if (count := len(config.maps.names)) > 1:
         name += f" (trained on {count} maps)"
     curve = figures.learning_curve(folder.read_metrics(), title=name)
     figures.save(curve, folder.figures / "learning_curve.png")

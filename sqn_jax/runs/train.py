@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
-from sqn_jax.maps import load_map, split_names
+from sqn_jax.maps import load_map
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation
@@ -76,7 +76,7 @@ def train_session(
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
     start = None if resume else _starting_policy(config)
-    occupancy_map = load_map(config.map, robot_radius=config.env.robot_radius)
+    occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
     num_windows(config, env_params)
@@ -98,7 +98,7 @@ def train_session(
         training = _Training(env_params, config, mesh, folder, checkpoints, start)
         runner = training.drive(runner, None if board is None else board.scalars)
         if occupancy_map.tiles != (1, 1):
-            first = split_names(config.map)[0]
+            first = config.maps.names[0]
             occupancy_map = load_map(first, robot_radius=config.env.robot_radius)
         results, drawn = final_evaluation.evaluate(runner, occupancy_map, config, folder)
         figures = final_evaluation.draw(drawn, occupancy_map, config, folder)

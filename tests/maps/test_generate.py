@@ -14,8 +14,9 @@ from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standi
 from scipy import ndimage, spatial
 
 from sqn_jax.baselines.shortest_paths import steps_between
+from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps import load_map, validate
-from sqn_jax.maps.generate import KINDS, generate
+from sqn_jax.maps.generate import generate
 from sqn_jax.maps.terrain import carve_tunnels, fill_pockets, smooth_path, spread, value_noise
 
 SCRIPT = Path(__file__).resolve().parents[2] / "experiments/draw_maps.py"

@@ -1,10 +1,13 @@
-"""What the commands share: their parser, options that several have, checks of words."""
+"""What the commands share: their parser, options that several have, checks of arguments."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NoReturn
+
+from sqn_jax.config.map_names import parse
 
 TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
     "points": "evaluation points",
@@ -41,17 +44,22 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def checkpoint(word: str) -> int | str:
+def checkpoint(argument: str) -> int | str:
     """Which checkpoint of a run."""
-    if word in ("newest", "best"):
-        return word
-    if word.isascii() and word.isdigit():
-        return int(word)
-    raise argparse.ArgumentTypeError(f"is {word}, expected newest, best or a number")
+    if argument in ("newest", "best"):
+        return argument
+    if argument.isascii() and argument.isdigit():
+        return int(argument)
+    raise argparse.ArgumentTypeError(f"is {argument}, expected newest, best or a number")
 
 
-def folder(word: str) -> Path:
+def folder(argument: str) -> Path:
     """The name of a folder."""
-    if not word.strip():
+    if not argument.strip():
         raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
-    return Path(word)
+    return Path(argument)
+
+
+def single_maps(arguments: Sequence[str]) -> tuple[str, ...]:
+    """The names of the maps that arguments stand for, one by one."""
+    return tuple(str(name) for argument in arguments for name in parse(argument).names)

@@ -1,4 +1,4 @@
-"""The words a user writes for maps."""
+"""Maps by their names, one and several."""
 
 from __future__ import annotations
 
@@ -8,43 +8,30 @@ import numpy as np
 import pytest
 from map_files import write_room
 
-from sqn_jax.maps import load_map, split_names, weighted_names
+from sqn_jax.config.map_names import MapFile, MapSet, ProceduralMap, ProjectMap, parse
+from sqn_jax.maps import load_map
 from sqn_jax.maps.generate import generate
 
 
-@pytest.mark.parametrize(
-    ("word", "names"),
-    [
-        ("maze", ["maze"]),
-        ("maze:7", ["maze:7"]),
-        ("maze:7-7", ["maze:7"]),
-        ("maze:8-10", ["maze:8", "maze:9", "maze:10"]),
-        ("maze, column:1-2,x/y.yaml", ["maze", "column:1", "column:2", "x/y.yaml"]),
-        ("ocean:1-2", ["ocean:1-2"]),
-        ("maze:1-", ["maze:1-"]),
-        ("x" * 5000, ["x" * 5000]),
-    ],
-)
-def test_a_word_stands_for_these_maps(word: str, names: list[str]) -> None:
-    assert split_names(word) == names
+def room_called(folder: Path, name: str) -> Path:
+    """A room's YAML file by another name."""
+    return write_room(folder, grey=np.full((60, 60), 254, dtype=np.uint8)).rename(folder / name)
 
 
-def test_a_file_may_have_a_comma_in_its_name(tmp_path: Path) -> None:
-    grey = np.full((60, 60), 254, dtype=np.uint8)
-    path = write_room(tmp_path, grey=grey).rename(tmp_path / "a,b.yaml")
-    assert split_names(str(path)) == [str(path)]
-    assert load_map(str(path)).name == "a,b"
+@pytest.mark.parametrize("name", ["a,b.yaml", "a*2.yaml", "a:1.yaml", ' a b".yaml', '"a".yaml'])
+def test_a_file_may_have_any_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    path = room_called(tmp_path, name)
+    monkeypatch.chdir(tmp_path)
+    for way in (str(path), name, path, Path(name), parse(path), MapFile(name), str(MapFile(name))):
+        assert load_map(way).name == Path(name).stem
+    with_others = load_map(f"{MapFile(name)}*2,{MapFile(str(write_room(tmp_path)))}")
+    assert with_others.weights == (2, 1)
 
 
-def test_weights_belong_to_the_maps_they_stand_behind(tmp_path: Path) -> None:
-    word = "maze*8,maze:0-1*3,cave:2, x/y.yaml*10"
-    expected = {"maze": 8, "maze:0": 3, "maze:1": 3, "cave:2": 1, "x/y.yaml": 10}
-    assert dict(weighted_names(word)) == expected
-    assert split_names(word) == list(expected)
+def test_weights_belong_to_the_maps_they_stand_behind() -> None:
     assert load_map("maze*8,maze:0-1*3").weights == (8, 3, 3)
-    starred = write_room(tmp_path, grey=np.full((60, 60), 254, dtype=np.uint8))
-    starred = starred.rename(tmp_path / "a*2")
-    assert weighted_names(str(starred)) == [(str(starred), 1)]
 
 
 def test_weights_tell_one_training_from_another() -> None:
@@ -69,8 +56,15 @@ def test_several_lie_side_by_side() -> None:
     np.testing.assert_array_equal(found.occupied[340:, 340:], generate("maze", 2).occupied)
 
 
+def test_text_and_what_is_parsed_from_it_are_the_same_map() -> None:
+    names = (ProjectMap("maze"), ProceduralMap("column", 3))
+    text, value = load_map("maze*2,column:3"), load_map(MapSet(names, (2, 1)))
+    assert (text.name, text.identity()) == (value.name, value.identity())
+    assert load_map(names[1]).identity() == load_map("column:3").identity()
+
+
 @pytest.mark.parametrize(
-    ("word", "names"),
+    ("text", "names"),
     [
         ("maze,", ["'maze,'", "missing"]),
         ("maze,maze", ["maze comes twice"]),
@@ -87,12 +81,17 @@ def test_several_lie_side_by_side() -> None:
         ("maze:9999999999", ["unknown map"]),
         ("ocean:3", ["unknown map", "ocean:3"]),
         ("../maze:3", ["unknown map"]),
-        ("", ["unknown map"]),
+        ("maze:1-", ["unknown map", "maze:1-"]),
+        ("ocean:1-2", ["unknown map", "ocean:1-2"]),
+        ("x" * 5000, ["unknown map"]),
+        ('"a"b,maze', ["unknown map", '"a"b']),
+        ('"",maze', ["missing"]),
+        ("", ["''", "missing"]),
     ],
 )
-def test_what_is_no_map_is_named_in_one_line(word: str, names: list[str]) -> None:
-    with pytest.raises(ValueError, match=r".") as told:
-        load_map(word)
-    assert "\n" not in str(told.value)
+def test_what_is_no_map_is_named_in_one_line(text: str, names: list[str]) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        load_map(text)
+    assert "\n" not in str(caught.value)
     for name in names:
-        assert name in str(told.value)
+        assert name in str(caught.value)
