@@ -112,8 +112,12 @@ def _resumed_config(
     """The settings in a run folder, perhaps with another number of episodes."""
     if given.run_dir is None:
         raise ValueError("--resume needs --run-dir, the folder of the run to go on with")
-    excess = [option(name, settings[name]) for name in settings if name != "total_episodes"]
-    excess += ["--preset"] * (given.preset is not None) + unknown
+    excess = [
+        option(name, value) + ("" if isinstance(value, bool) else f" {value}")
+        for name, value in settings.items()
+        if name != "total_episodes"
+    ]
+    excess += ([f"--preset {given.preset}"] if given.preset else []) + unknown
     if excess:
         raise ValueError(
             "--resume takes every setting from the run folder, expected no option but --run-dir, "

@@ -181,9 +181,9 @@ def test_resume_takes_the_settings_from_the_folder_and_says_so(
         *(True, "cpu", 1, True),
     )
     for excess, named in (
-        (["--seed", "5"], "--seed"),
+        (["--seed", "5"], "--seed 5"),
         (["--learner.no_double_q"], "--learner.no-double-q"),
-        (["--preset", "smoke"], "--preset"),
+        (["--preset", "smoke"], "--preset smoke"),
         (["--bogus", "1"], "--bogus 1"),
         (["extra"], "extra"),
     ):
