@@ -146,22 +146,17 @@ class MapSet:
         return MapSet(names, self.weights)
 
     def _parts(self, *, stems: bool = False) -> Iterator[str]:
-        start = 0
-        while start < len(self.names):
-            name, weight = self.names[start], self.weights[start]
-            text = Path(name.path).stem if stems and isinstance(name, MapFile) else str(name)
-            end = start + 1
-            if isinstance(name, ProceduralMap):
-                while (
-                    end < len(self.names)
-                    and self.names[end] == _next(name, end - start)
-                    and self.weights[end] == weight
-                ):
-                    end += 1
-                if end - start > 1:
-                    text += f"-{name.seed + end - start - 1}"
+        runs: list[tuple[MapName, MapName, int]] = []  # First, last, weight.
+        for name, weight in zip(self.names, self.weights, strict=True):
+            if runs and runs[-1][2] == weight and _follows(name, runs[-1][1]):
+                runs[-1] = (runs[-1][0], name, weight)
+            else:
+                runs.append((name, name, weight))
+        for first, last, weight in runs:
+            text = Path(first.path).stem if stems and isinstance(first, MapFile) else str(first)
+            if isinstance(last, ProceduralMap) and last != first:
+                text += f"-{last.seed}"
             yield text + (f"*{weight}" if weight > 1 else "")
-            start = end
 
 
 def parse(text: str | Path) -> MapSet:
@@ -238,9 +233,12 @@ def _is_file(text: str) -> bool:
         return False
 
 
-def _next(name: ProceduralMap, steps: int) -> ProceduralMap | None:
-    seed = name.seed + steps
-    return ProceduralMap(name.kind, seed) if seed <= MAX_SEED else None
+def _follows(name: MapName, before: MapName) -> bool:
+    return (
+        isinstance(name, ProceduralMap)
+        and isinstance(before, ProceduralMap)
+        and (name.kind, name.seed) == (before.kind, before.seed + 1)
+    )
 
 
 def _shortened(text: str) -> str:

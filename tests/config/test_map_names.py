@@ -110,6 +110,7 @@ def test_weights_belong_to_the_maps_they_stand_behind() -> None:
     assert maps.weights == (8, 3, 3, 1, 1, 10)
     assert str(maps) == "maze*8,maze:0-1*3,maze:2-3,x/y.yaml*10"
     assert str(parse("maze*1,maze:2*2,maze:3")) == "maze,maze:2*2,maze:3"
+    assert str(parse("maze:1,column:2,maze:4")) == "maze:1,column:2,maze:4"
 
 
 @pytest.mark.parametrize("name", ["a,b.yaml", "a*2", "maze,maze:1", " c.yaml"])
