@@ -52,8 +52,8 @@ MAP_SETS = st.lists(
 
 
 @given(MAP_SETS)
-@example(MapSet((MapFile("a,b.yaml"), MapFile('"/c"'), MapFile("d*2.map*3")), (1, 2, 1)))
-@example(MapSet((MapFile(" a.yaml\n"), MapFile("maze"), MapFile("maze:7")), (1, 1, 1)))
+@example(MapSet((MapFile("a,b.yaml"), MapFile('"/c"'), MapFile("/d*3")), (1, 2, 1)))
+@example(MapSet((MapFile(" a.yaml"), MapFile("maze"), MapFile("maze:7")), (1, 1, 1)))
 @example(MapSet((MapFile("\ud800,.yaml"),), (1,)))
 def test_the_text_of_maps_reads_as_the_same_maps(maps: MapSet) -> None:
     assert parse(str(maps)) == maps
