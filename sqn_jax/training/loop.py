@@ -47,6 +47,10 @@ from sqn_jax.training.state import RunnerState, init_runner, runner_specs
 Metrics = dict[str, Array]
 """Scalars to log, and the mean weight of each skill [K]."""
 
+Carry = tuple[LearnerState, Fleet, Array]
+"""What goes from window to window: the learner, the robots, and which of them [N] have had a new
+task in this round."""
+
 LEARN = {"r2d2": r2d2.learn, "pqn": pqn.learn}
 
 
@@ -93,11 +97,6 @@ def train_round(
     }
     learner = dataclasses.replace(learner, round=learner.round + 1)
     return RunnerState(learner=learner, key=key), metrics
-
-
-Carry = tuple[LearnerState, Fleet, Array]
-"""What goes from window to window: the learner, the robots, and which of them [N] have had a new
-task in this round."""
 
 
 def rollout_and_learn(
