@@ -81,7 +81,7 @@ def pqn_loss(
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
 
-    The steps are fresh, so the recurrent state they were driven with serves as the first one;
+    The steps are fresh, so the recurrent state they were taken with serves as the first one;
     there is no burn-in, no replay and no target network. Arguments as for `r2d2_loss`.
     """
     config = program.config.learner

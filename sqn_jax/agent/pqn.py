@@ -1,7 +1,7 @@
 """Recurrent PQN: many robots, fresh steps, Q(lambda) targets; no replay, no target network.
 
-Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024). The robots drive a
-window of an episode, the network is updated on it, and they drive on with the new network; the
+Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024). The robots act for
+a window of an episode, the network is updated on it, and they go on with the new network; the
 recurrent state is handed from window to window. Layer normalization takes the place of the target
 network.
 """

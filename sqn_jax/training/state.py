@@ -69,10 +69,10 @@ def trajectory_shapes(env_params: EnvParams, program: Program) -> Episodes:
     network, num_envs = program.network, program.config.num_envs
 
     def one_unroll(key: Array) -> Episodes:
-        fleet = start_fleet(jax.random.split(key, num_envs), network, env_params)
-        params = network.init(key, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
+        actors = start_fleet(jax.random.split(key, num_envs), network, env_params)
+        params = network.init(key, jax.tree.map(lambda x: x[None], actors.obs), actors.carry)
         draws = draw_chance(key, program.window_length, num_envs)
-        return unroll(draws, network, params, fleet, jnp.zeros(num_envs), env_params)[1]
+        return unroll(draws, network, params, actors, jnp.zeros(num_envs), env_params)[1]
 
     return jax.eval_shape(one_unroll, jax.random.key(0))
 
