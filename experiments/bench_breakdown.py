@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from experiments.bench_simulator import draw_actions
-from experiments.timing import Program, four_digits, time_in_turns
+from experiments.timing import Timed, four_digits, time_in_turns
 from sqn_jax.agent import pqn
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
@@ -69,7 +69,7 @@ PIECES: dict[str, Piece] = {
 }
 
 
-def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int) -> Program:
+def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int) -> Timed:
     """A piece for N robots with random actions, T steps in one compiled scan."""
     start_key, action_key, step_key = jax.random.split(jax.random.key(0), 3)
     _, states = jax.jit(jax.vmap(navigation.reset, in_axes=(0, None)))(
@@ -85,31 +85,29 @@ def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int
     return lambda turn: drive(states, actions, params)
 
 
-def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program]:
+def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Timed]:
     """The two halves of a window of recurrent PQN: drive it, learn from it."""
-    network = loop.network_of(config)
-    runner = loop.start_run(params, config)
+    program = loop.make_program(params, config)
+    network = program.network
+    learner = loop.start_run(params, program).learner
     key = jax.random.key(1)
     keys = jax.random.split(key, config.num_envs)
     fleet = jax.jit(lambda keys, params: start_fleet(keys, network, params))(keys, params)
-    num_steps = params.max_steps // loop.num_windows(config, params)
     epsilon = jnp.zeros(config.num_envs)
 
     @jax.jit
     def drive(learner: Any, fleet: Any, params: EnvParams) -> Any:
-        chance = draw_chance(key, num_steps, config.num_envs)
+        chance = draw_chance(key, program.window_length, config.num_envs)
         return unroll(chance, network, learner.params, fleet, epsilon, params)[1]
 
-    optimizer = loop.optimizer_of(config, params)
-
     @jax.jit
-    def learn(learner: Any, episodes: Any) -> Any:
-        return pqn.learn(key, learner, None, episodes, network, optimizer, config)[0]
+    def learn(learner: Any, trajectory: Any) -> Any:
+        return pqn.learn(key, learner, trajectory, program)[0]
 
-    episodes = drive(runner.learner, fleet, params)
+    trajectory = drive(learner, fleet, params)
     return {
-        "drive a window": lambda turn: drive(runner.learner, fleet, params),
-        "learn from a window": lambda turn: learn(runner.learner, episodes),
+        "drive a window": lambda turn: drive(learner, fleet, params),
+        "learn from a window": lambda turn: learn(learner, trajectory),
     }
 
 
@@ -124,12 +122,12 @@ def measure(
         num_steps: steps of the simulator's pieces in one call.
         repeats: turns.
     """
-    programs: dict[str, Program] = {
+    programs: dict[str, Timed] = {
         name: piece_program(piece, params, config.num_envs, num_steps)
         for name, piece in PIECES.items()
     }
     windows = window_programs(config, params)
-    window_steps = params.max_steps // loop.num_windows(config, params)
+    window_steps = loop.make_program(params, config).window_length
     timings = time_in_turns(programs | windows, repeats)
     entries = []
     for name, timing in timings.items():

@@ -19,20 +19,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from experiments.operations import update_operations
-from experiments.timing import Program, Timing, four_digits, time_in_turns
-from sqn_jax.agent import Episodes, QNetwork, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
+from experiments.timing import Timed, Timing, four_digits, time_in_turns
+from sqn_jax.agent import Episodes, r2d2, replay
+from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.loss import r2d2_loss
-from sqn_jax.agent.replay import ReplayState
+from sqn_jax.agent.program import Program
+from sqn_jax.agent.shards import AXIS
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import devices, loop
+from sqn_jax.training.devices import REPLICATED
+from sqn_jax.training.state import runner_specs, trajectory_shapes
 
 Name = tuple[str, str]
 """What is timed, an agent or PRODUCT, and in which program."""
@@ -48,12 +50,9 @@ STORED_BATCHES = 4
 class Problem:
     """What an agent is timed on: U updates of B episodes."""
 
-    config: TrainConfig
-    network: QNetwork
-    optimizer: optax.GradientTransformation
+    program: Program
     learner: LearnerState
-    memory: ReplayState
-    """A full replay of random episodes."""
+    """With a full replay of random episodes."""
     episodes: Episodes
     """[U, ...] a batch for each update."""
     weights: Array
@@ -73,19 +72,17 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     capacity = STORED_BATCHES * batch_size
     settings = dataclasses.replace(config.replay, capacity=capacity, min_episodes=batch_size)
     config = dataclasses.replace(config, method="r2d2", num_envs=batch_size, replay=settings)
-    runner = loop.start_run(env_params, config)
-    shapes = loop.episode_shapes(config, env_params)
+    program = loop.make_program(env_params, config)
+    learner = loop.start_run(env_params, program).learner
+    shapes = trajectory_shapes(env_params, program)
     rng = np.random.default_rng(config.seed)
-    memory = runner.memory
+    memory = learner.memory
     for _ in range(STORED_BATCHES):
         memory = replay.add(memory, r2d2.pack(random_episodes(rng, shapes)))
     batches = [random_episodes(rng, shapes) for _ in range(num_updates)]
     return Problem(
-        config=config,
-        network=loop.network_of(config),
-        optimizer=loop.optimizer_of(config, env_params),
-        learner=runner.learner,
-        memory=memory,
+        program=program,
+        learner=dataclasses.replace(learner, memory=memory),
         episodes=jax.tree.map(lambda *x: jnp.stack(x), *batches),
         weights=jnp.asarray(rng.uniform(0.1, 1.0, (num_updates, batch_size)), jnp.float32),
     )
@@ -102,112 +99,75 @@ def random_episodes(rng: np.random.Generator, shapes: Episodes) -> Episodes:
     )
 
 
-def update_from_drawn(
-    state: LearnerState,
-    batch: tuple[Episodes, Array],
-    *,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    config: TrainConfig,
-    axis_name: str | None,
-) -> tuple[LearnerState, tuple[Array, dict[str, Array]]]:
-    """One update of `r2d2.learn` without drawing and storing.
+def drawn_program(problem: Problem, mesh: Mesh | None) -> Timed:
+    """U updates from the problem's batches, in one compiled scan: no drawing, no storing."""
+    program = dataclasses.replace(problem.program, mesh=mesh)
 
-    Args:
-        state: the learner.
-        batch: episodes and importance weights [B].
-        network: the agent.
-        optimizer: of the learner.
-        config: the run.
-        axis_name: of devices that each have their share of the batch.
+    def update(state: LearnerState, batch: tuple[Episodes, Array]) -> Any:
+        state, priorities, metrics = r2d2.learn_from(state, *batch, program)
+        return state, (priorities, metrics)
 
-    Returns:
-        The new state, and priorities [B] and metrics.
-    """
-    episodes, weights = batch
-
-    def loss_function(params: Any) -> Any:
-        return r2d2_loss(params, state.target_params, network, episodes, weights, config.learner)
-
-    state, output, metrics = gradient_step(state, optimizer, loss_function, axis_name)
-    state = update_target(state, config.learner.target_update_rate)
-    share = config.replay.max_priority_weight
-    return state, (replay.sequence_priorities(output.td_errors, share), metrics)
+    robots: Any = PartitionSpec(None, AXIS)
+    steps: Any = PartitionSpec(None, None, AXIS)
+    specs = (Episodes(steps, steps, steps, steps, robots), robots)
+    scan = _scan(update, program, REPLICATED, specs, (robots, REPLICATED))
+    batches = devices.place((problem.episodes, problem.weights), mesh, specs)
+    learner = devices.place(dataclasses.replace(problem.learner, memory=None), mesh)
+    return _carried_on(lambda state, turn: scan(state, batches), learner)
 
 
-def drawn_program(problem: Problem, mesh: Mesh | None) -> Program:
-    """U updates from the problem's batches, in one compiled scan."""
-    update = partial(update_from_drawn, **_static(problem, mesh))
-    batches = (problem.episodes, problem.weights)
-    robots: Any = PartitionSpec(None, devices.AXIS)
-    steps: Any = PartitionSpec(None, None, devices.AXIS)
-    divided = (Episodes(steps, steps, steps, steps, robots), robots)
-    scan = _scan(problem, update, mesh, WHOLE, divided, (robots, WHOLE))
-    placed = devices.place(batches, mesh, divided)
-    return _carried_on(
-        lambda state, turn: scan(state, placed), devices.place(problem.learner, mesh)
-    )
-
-
-def sampling_program(problem: Problem, mesh: Mesh | None) -> Program:
+def sampling_program(problem: Problem, mesh: Mesh | None) -> Timed:
     """U whole updates: draw by priority, learn, store the priorities."""
-    # The scan body of `r2d2.learn`, which without it would also store a round of new episodes.
-    update = partial(r2d2._update, **_static(problem, mesh), discount=None)
-    held = (WHOLE, loop.runner_specs(problem.config).memory)
-    scan = _scan(problem, update, mesh, held, WHOLE, WHOLE)
+    program = dataclasses.replace(problem.program, mesh=mesh)
+
+    def update(state: LearnerState, key: Array) -> Any:
+        return r2d2.update(key, state, program)
+
+    specs = runner_specs(program).learner
+    scan = _scan(update, program, specs, REPLICATED, REPLICATED)
     num_updates = problem.weights.shape[0]
     return _carried_on(
         lambda state, turn: scan(state, jax.random.split(jax.random.key(turn), num_updates)),
-        devices.place((problem.learner, problem.memory), mesh, held),
+        devices.place(problem.learner, mesh, specs),
     )
 
 
-WHOLE = PartitionSpec()
-
-
-def _static(problem: Problem, mesh: Mesh | None) -> dict[str, Any]:
-    return {
-        "network": problem.network,
-        "optimizer": problem.optimizer,
-        "config": problem.config,
-        "axis_name": None if mesh is None else devices.AXIS,
-    }
-
-
-def _scan(
-    problem: Problem, update: Any, mesh: Mesh | None, held: Any, given: Any, told: Any
-) -> Any:
-    """A compiled scan of updates; how state, inputs and results are divided between devices."""
+def _scan(update: Any, program: Program, state: Any, inputs: Any, outputs: Any) -> Any:
+    """A compiled scan of updates; specs say how state, inputs and outputs are divided."""
     scan = partial(jax.lax.scan, update)
-    if mesh is not None:
+    if program.mesh is not None:
         scan = jax.shard_map(
-            scan, mesh=mesh, in_specs=(held, given), out_specs=(held, told), check_vma=False
+            scan,
+            mesh=program.mesh,
+            in_specs=(state, inputs),
+            out_specs=(state, outputs),
+            check_vma=False,
         )
-    options = devices.compiler_options(problem.config)
+    options = devices.compiler_options(program.config)
     return jax.jit(scan, donate_argnums=0, compiler_options=options)
 
 
-def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Program:
-    """A program that goes on each time from the state it left; the state is donated."""
-    held = jax.tree.map(jnp.copy, state)
+def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Timed:
+    """What goes on each time from the state it left; the state is donated."""
+    state = jax.tree.map(jnp.copy, state)
 
-    def program(turn: int) -> Any:
-        nonlocal held
-        held, told = update(held, turn)
-        return told
+    def next_updates(turn: int) -> Any:
+        nonlocal state
+        state, outputs = update(state, turn)
+        return outputs
 
-    return program
+    return next_updates
 
 
-def product_programs(size: int, options: dict[str, str | bool]) -> dict[Name, Program]:
+def product_programs(size: int, options: dict[str, str | bool]) -> dict[Name, Timed]:
     """A product of two float32 matrices [size, size] in JAX, compiled as usual and with options."""
     left, right = jax.random.normal(jax.random.key(0), (2, size, size))
 
-    def program(**how: Any) -> Program:
+    def program(**how: Any) -> Timed:
         multiply = jax.jit(jnp.matmul, **how)
         return lambda turn: multiply(left, right)
 
-    found: dict[Name, Program] = {(PRODUCT, JAX): program()}
+    found: dict[Name, Timed] = {(PRODUCT, JAX): program()}
     if options:
         found[PRODUCT, JAX_AS_TRAINED] = program(compiler_options=options)
     return found
@@ -215,19 +175,19 @@ def product_programs(size: int, options: dict[str, str | bool]) -> dict[Name, Pr
 
 def torch_programs(
     problem: Problem | None, threads: Sequence[int], product_size: int
-) -> dict[Name, Program]:
+) -> dict[Name, Timed]:
     """The same in PyTorch: products and, given a problem of the SQN, U updates from its batches."""
     import torch
 
     from experiments import torch_sqn
 
     left, right = torch.randn(2, product_size, product_size)
-    found: dict[Name, Program] = {}
+    found: dict[Name, Timed] = {}
     for count in threads:
         name = torch_name(count)
         found[PRODUCT, name] = _with_threads(count, lambda: left @ right)
         if problem is not None:
-            settings = problem.config
+            settings = problem.program.config
             learner = torch_sqn.Learner(
                 torch_network(problem), settings.learner, settings.replay.max_priority_weight
             )
@@ -244,7 +204,7 @@ def torch_name(threads: int) -> str:
     return f"PyTorch, {threads} thread{'s' if threads > 1 else ''}"
 
 
-def _with_threads(count: int, work: Callable[[], Any]) -> Program:
+def _with_threads(count: int, work: Callable[[], Any]) -> Timed:
     import torch
 
     def program(turn: int) -> Any:
@@ -260,7 +220,7 @@ def torch_network(problem: Problem) -> Any:
 
     obs = problem.episodes.obs
     sizes = (obs.ranges.shape[-1], obs.goal.shape[-1], NUM_ACTIONS)
-    network = torch_sqn.SkillQNetwork(problem.config.network, *sizes)
+    network = torch_sqn.SkillQNetwork(problem.program.config.network, *sizes)
     torch_sqn.copy_params(network, problem.learner.params)
     return network
 
@@ -271,10 +231,10 @@ def torch_difference(problem: Problem) -> float:
 
     from experiments import torch_sqn
 
-    params, config = problem.learner.params, problem.config.learner
+    params, config = problem.learner.params, problem.program.config.learner
     episodes, weights = problem.batch(0)
-    loss = jax.jit(partial(r2d2_loss, network=problem.network, config=config))
-    _, output = loss(params, params, episodes=episodes, weights=weights)
+    loss = jax.jit(r2d2_loss, static_argnames="program")
+    _, output = loss(params, params, episodes, weights, config.discount, problem.program)
     network = torch_network(problem)
     with torch.no_grad():
         batch = torch_sqn.to_torch(episodes, weights)
@@ -353,7 +313,7 @@ def _entry(
     problem: Problem, program: str, timing: Timing, products_gflops: float
 ) -> dict[str, Any]:
     """What is told of one agent and program."""
-    config, obs = problem.config, problem.episodes.obs
+    config, obs = problem.program.config, problem.episodes.obs
     num_updates, num_steps, batch_size = problem.episodes.actions.shape
     operations = update_operations(
         config.algo,

@@ -17,7 +17,8 @@ import jax
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-from experiments.timing import Program, time_in_turns
+from experiments.timing import Timed, time_in_turns
+from sqn_jax.agent.shards import AXIS
 from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import devices
@@ -26,14 +27,14 @@ Drive = Callable[[Array, Any, int], Any]
 """Takes a key, what a world is made of, and a number of robots N; returns arrays [T, N, ...]."""
 
 
-def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Program:
+def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Timed:
     """Robots on one device, or as many on each of several, with chance of their own."""
     if mesh is None:
         alone = jax.jit(drive, static_argnums=2)
         return lambda turn: alone(jax.random.key(turn), world, num_envs)
 
     def share(key: Array, world: Any) -> Any:
-        own_key = jax.random.fold_in(key, jax.lax.axis_index(devices.AXIS))
+        own_key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
         return drive(own_key, world, num_envs // mesh.size)
 
     together = jax.jit(
@@ -41,7 +42,7 @@ def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Progr
             share,
             mesh=mesh,
             in_specs=(PartitionSpec(), PartitionSpec()),
-            out_specs=PartitionSpec(None, devices.AXIS),
+            out_specs=PartitionSpec(None, AXIS),
             check_vma=False,
         )
     )
@@ -100,7 +101,7 @@ def jaxnav(num_steps: int, *, resets: bool) -> Drive | None:
 
 def programs(
     maps: Sequence[str], counts: Sequence[int], num_steps: int
-) -> dict[tuple[str, int], Program]:
+) -> dict[tuple[str, int], Timed]:
     """What is timed, by name and number of robots."""
     ours = partial(drive_ours, num_steps=num_steps)
     drives: dict[str, tuple[Drive | None, Any]] = {
@@ -108,7 +109,7 @@ def programs(
     }
     for resets, name in ((False, "JaxNav"), (True, "JaxNav, reset in every step")):
         drives[name] = (jaxnav(num_steps, resets=resets), None)
-    found: dict[tuple[str, int], Program] = {}
+    found: dict[tuple[str, int], Timed] = {}
     for name, (drive, world) in drives.items():
         for mesh in devices.one_and_all():
             for count in counts:

@@ -15,6 +15,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import devices, loop
+from sqn_jax.training.state import memory_bytes, trajectory_shapes
 
 
 def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[str, Any]:
@@ -30,15 +31,16 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
         compile and of the first call.
     """
     mesh = devices.choose(config)
-    runner = loop.start_run(env_params, config, mesh)
-    program, compile_seconds = loop.compile_chunk(env_params, config, mesh)
+    program = loop.make_program(env_params, config, mesh)
+    runner = loop.start_run(env_params, program)
+    compiled, compile_seconds = loop.compile_chunk(env_params, program)
     env_params = devices.place(env_params, mesh)
     warm_up = 0.0
     seconds: list[float] = []
     updates = 0
     while len(seconds) < repeats:
         started = time.perf_counter()
-        runner, metrics = program(runner, env_params)
+        runner, metrics = compiled(runner, env_params)
         jax.block_until_ready((runner, metrics))
         lasted = time.perf_counter() - started
         if updates:
@@ -48,7 +50,7 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
     timing = Timing(warm_up, tuple(seconds))
     rounds = config.rounds_per_chunk * config.num_seeds
     steps = rounds * config.num_envs * env_params.max_steps
-    updates_a_chunk = rounds * loop.updates_a_round(config, env_params)
+    updates_a_chunk = rounds * program.updates_per_round
     return {
         "algo": config.algo,
         "method": config.method,
@@ -67,14 +69,15 @@ def memory(config: TrainConfig, env_params: EnvParams) -> dict[str, int]:
 
     `replay_bytes` is the replay (0 without one), `run_bytes` adds the episodes of one round.
     """
-    item = r2d2.packed_item(loop.episode_shapes(config, env_params))
+    program = loop.make_program(env_params, config)
+    item = r2d2.packed_item(trajectory_shapes(env_params, program))
     has_replay = config.method == "r2d2"
     capacity = config.replay.capacity if has_replay else 0
     return {
         "peak_process_bytes": peak_bytes(),
         "replay_episodes": capacity,
         "replay_bytes": replay.num_bytes(item, capacity) if has_replay else 0,
-        "run_bytes": loop.memory_bytes(config, env_params),
+        "run_bytes": memory_bytes(env_params, program),
     }
 
 

@@ -97,7 +97,7 @@ def machine() -> dict[str, Any]:
     versions = {name: _version(name) for name in ("jax", "torch", "jaxmarl")}
     return {
         "command": " ".join(["experiments/benchmark.py", *sys.argv[1:]]),
-        "device": devices.words(),
+        "device": devices.describe(),
         "cpu": devices.cpu_model(),
         "cpu_count": os.cpu_count(),
         "versions": {"sqn_jax": sqn_jax.__version__}

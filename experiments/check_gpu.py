@@ -113,7 +113,7 @@ def main() -> None:
     options = parser.parse_args()
     if jax.devices()[0].platform != "gpu":
         raise ValueError(
-            f"JAX finds only {devices.words()}, expected a GPU to compare with the CPU"
+            f"JAX finds only {devices.describe()}, expected a GPU to compare with the CPU"
         )
     simulators = {name: compare_simulators(name) for name in ("maze", "cave")}
     for name, entry in simulators.items():
@@ -132,7 +132,7 @@ def main() -> None:
     else:
         print("there are no kernels of the GRU for this GPU: scans everywhere")
     if options.out is not None:
-        made = {"device": devices.words(), "jax": jax.__version__}
+        made = {"device": devices.describe(), "jax": jax.__version__}
         found = {"simulators": simulators, "recurrences": recurrences}
         write_json(options.out, made | found)
 

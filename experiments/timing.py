@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import jax
 
-Program = Callable[[int], Any]
+Timed = Callable[[int], Any]
 """What is timed: takes the number of the turn and returns results, which are waited for."""
 
 Name = TypeVar("Name", bound=Hashable)
@@ -45,7 +45,7 @@ def four_digits(value: float) -> float:
     return round(value) if value >= 1000 else float(f"{value:.4g}")
 
 
-def time_in_turns(programs: Mapping[Name, Program], repeats: int) -> dict[Name, Timing]:
+def time_in_turns(programs: Mapping[Name, Timed], repeats: int) -> dict[Name, Timing]:
     """Time programs one after the other, again and again.
 
     All are called once first, to compile and to warm up. Then each runs once a turn, so that a busy
@@ -59,7 +59,7 @@ def time_in_turns(programs: Mapping[Name, Program], repeats: int) -> dict[Name, 
     return {name: Timing(first_call[name], tuple(seconds[name])) for name in programs}
 
 
-def _seconds(program: Program, turn: int) -> float:
+def _seconds(program: Timed, turn: int) -> float:
     started = time.perf_counter()
     jax.block_until_ready(program(turn))
     return time.perf_counter() - started

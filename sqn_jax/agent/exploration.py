@@ -28,7 +28,7 @@ def epsilon_per_robot(progress: Array, num_envs: int, config: ExplorationConfig)
 
 
 def draw_exploration(key: Array, shape: tuple[int, ...], num_actions: int) -> tuple[Array, Array]:
-    """Draw all the chance that `epsilon_greedy` needs, for many steps at once.
+    """Draw all the random numbers that `epsilon_greedy` needs, for many steps at once.
 
     On the CPU a few random numbers cost as much as many thousand: drawn step by step they would
     take longer than the network.
@@ -39,24 +39,24 @@ def draw_exploration(key: Array, shape: tuple[int, ...], num_actions: int) -> tu
         num_actions: A.
 
     Returns:
-        Coins in 0..1 and actions in 0..A - 1, int32, of the given shape, all independent.
+        Uniform draws in 0..1 and actions in 0..A - 1, int32, of the given shape, all independent.
     """
-    coin_key, action_key = jax.random.split(key)
-    coins = jax.random.uniform(coin_key, shape)
-    return coins, jax.random.randint(action_key, shape, 0, num_actions)
+    uniform_key, action_key = jax.random.split(key)
+    uniform = jax.random.uniform(uniform_key, shape)
+    return uniform, jax.random.randint(action_key, shape, 0, num_actions)
 
 
-def epsilon_greedy(q_values: Array, epsilon: Array, coins: Array, random_actions: Array) -> Array:
+def epsilon_greedy(q_values: Array, epsilon: Array, uniform: Array, random_actions: Array) -> Array:
     """Choose the best of A actions, or with probability `epsilon` any of them.
 
     Args:
         q_values: [N, A].
         epsilon: [N].
-        coins: [N] from `draw_exploration`.
+        uniform: [N] from `draw_exploration`.
         random_actions: [N] from `draw_exploration`.
 
     Returns:
         [N] int32 actions.
     """
     best = jnp.argmax(q_values, axis=-1).astype(jnp.int32)
-    return jnp.where(coins < epsilon, random_actions, best)
+    return jnp.where(uniform < epsilon, random_actions, best)

@@ -1,4 +1,4 @@
-"""Parameters, optimiser and one gradient step, shared by both methods."""
+"""What learning changes, and one gradient step; shared by both methods."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.loss import LossOutput
-from sqn_jax.agent.networks import Params, QNetwork, initial_carry
-from sqn_jax.agent.shares import mean
-from sqn_jax.config import LearnerConfig
+from sqn_jax.agent.networks import HasObservation, Params, initial_carry
+from sqn_jax.agent.program import Program
+from sqn_jax.agent.replay import ReplayState
+from sqn_jax.agent.shards import mean
+from sqn_jax.config import LearnerConfig, TrainConfig
 
 
 @struct.dataclass
@@ -29,10 +31,24 @@ class LearnerState:
     """Slowly following copy: r2d2 learns towards it, pqn only hands it out. None without one."""
     opt_state: Any
     """Adam's moments and counter."""
+    memory: Any
+    """`ReplayState` of whole episodes for r2d2; None for pqn."""
+    round: Array
+    """int32: rounds of the run that are done."""
     num_updates: Array
     """int32, those left out included."""
     num_skipped: Array
     """int32: updates left out because their loss or gradient was not finite."""
+
+
+def progress(state: LearnerState, program: Program) -> Array:
+    """How much of the run is done, 0..1."""
+    return state.round / program.config.num_rounds
+
+
+def current_discount(state: LearnerState, program: Program) -> Array | float:
+    """The discount of this round."""
+    return discount_schedule(progress(state, program), program.config.learner)
 
 
 def discount_schedule(progress: Array, config: LearnerConfig) -> Array | float:
@@ -49,32 +65,24 @@ def discount_schedule(progress: Array, config: LearnerConfig) -> Array | float:
     return 1 - start * (end / start) ** jnp.clip(progress, 0.0, 1.0)
 
 
-def make_optimizer(config: LearnerConfig, total_updates: int) -> optax.GradientTransformation:
-    """Adam with gradients clipped by their global norm and the configured schedule."""
-    learning_rate: float | optax.Schedule = config.learning_rate
-    if config.learning_rate_schedule == "linear":
-        learning_rate = optax.linear_schedule(config.learning_rate, 0.0, total_updates)
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.adam(learning_rate, eps=config.adam_epsilon),
-    )
+def policy_params(state: LearnerState, config: TrainConfig) -> Params:
+    """The parameters to evaluate and to ship: the averaged ones where there are any."""
+    return state.target_params if config.averages_params else state.params
 
 
 def init_learner(
-    key: Array,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    obs: Any,
-    *,
-    use_target: bool,
+    key: Array, obs: HasObservation, program: Program, memory: ReplayState | None = None
 ) -> LearnerState:
     """Fresh parameters for observations like `obs` [T, B, ...]; the key is consumed."""
-    batch_size = jax.tree.leaves(obs)[0].shape[1]
-    params = network.init(key, obs, initial_carry(network.config, batch_size))
+    config = program.config
+    params = program.network.init(key, obs, initial_carry(config.network, obs.ranges.shape[1]))
+    has_target = config.method == "r2d2" or config.averages_params
     return LearnerState(
         params=params,
-        target_params=jax.tree.map(jnp.copy, params) if use_target else None,
-        opt_state=optimizer.init(params),
+        target_params=jax.tree.map(jnp.copy, params) if has_target else None,
+        opt_state=program.optimizer.init(params),
+        memory=memory,
+        round=jnp.int32(0),
         num_updates=jnp.int32(0),
         num_skipped=jnp.int32(0),
     )
@@ -82,30 +90,29 @@ def init_learner(
 
 def gradient_step(
     state: LearnerState,
-    optimizer: optax.GradientTransformation,
     loss_function: Callable[[Params], tuple[Array, LossOutput]],
-    axis_name: str | None = None,
+    program: Program,
 ) -> tuple[LearnerState, LossOutput, dict[str, Array]]:
-    """One step of the optimiser down a loss of the online parameters.
+    """One step of the optimizer down a loss of the online parameters.
 
     A step whose loss or gradient is not finite is left out and counted: one overflow, in one of
-    thousands of minibatches, would else end in parameters that are no numbers. With the name of an
-    axis of devices, down the mean of their losses: each takes the same step.
+    thousands of minibatches, would else end in parameters that are no numbers. On several devices,
+    down the mean of their losses: each takes the same step.
 
     Returns:
         The new state, the loss's by-products, and scalars worth logging.
     """
     (loss, output), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params)
-    told = {
+    metrics = {
         "loss": loss,
         "mean_q": output.mean_q,
         "gate_entropy": output.gate_entropy,
         "skill_distance": output.skill_distance,
     }
-    gradient, told = mean((gradient, told), axis_name)
-    updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+    gradient, metrics = mean((gradient, metrics), program.axis_name)
+    updates, opt_state = program.optimizer.update(gradient, state.opt_state, state.params)
     norm = optax.tree.norm(gradient)
-    is_finite = jnp.isfinite(told["loss"]) & jnp.isfinite(norm)
+    is_finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
     params, opt_state = jax.tree.map(
         partial(jnp.where, is_finite),
         (optax.apply_updates(state.params, updates), opt_state),
@@ -118,7 +125,7 @@ def gradient_step(
         num_updates=state.num_updates + 1,
         num_skipped=state.num_skipped + ~is_finite,
     )
-    return new_state, output, told | {"gradient_norm": norm}
+    return new_state, output, metrics | {"gradient_norm": norm}
 
 
 def average_params(state: LearnerState, share: float) -> LearnerState:

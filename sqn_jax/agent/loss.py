@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from jax import Array
 
 from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.networks import Params, QNetwork, QOutput
+from sqn_jax.agent.program import Program
 from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
 from sqn_jax.config import LearnerConfig
 
@@ -33,11 +36,10 @@ class LossOutput:
 def r2d2_loss(
     params: Params,
     target_params: Params,
-    network: QNetwork,
-    episodes: Episodes,
+    trajectory: Episodes,
     weights: Array,
-    config: LearnerConfig,
-    discount: Array | float | None = None,
+    discount: Array | float,
+    program: Program,
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error after burn-in, against n-step double-Q targets (R2D2, section 2.3).
 
@@ -48,84 +50,86 @@ def r2d2_loss(
     Args:
         params: online parameters.
         target_params: target parameters.
-        network: one of the three.
-        episodes: [T (+ 1), B, ...].
+        trajectory: [T (+ 1), B, ...].
         weights: [B] importance-sampling weights.
-        config: the learner's settings.
-        discount: the discount of the moment; `config.discount` if None.
+        discount: gamma, that of the moment.
+        program: its network and its learner's settings.
 
     Returns:
         The loss and its by-products.
     """
+    config = program.config.learner
     burn_in = config.burn_in_length
-    online = _values_after_burn_in(network, params, episodes, burn_in)
-    target = _values_after_burn_in(network, target_params, episodes, burn_in)
+    online = _outputs_after_burn_in(params, trajectory, burn_in, program.network)
+    target = _outputs_after_burn_in(target_params, trajectory, burn_in, program.network)
     chooser = online if config.double_q else target
     best_action = jnp.argmax(chooser.q_values, axis=-1)
     bootstrap = jax.lax.stop_gradient(_pick(target.q_values, best_action))
-    learned = jax.tree.map(
-        lambda x: x[burn_in:], (episodes.actions, episodes.rewards, episodes.terminated)
+    learned = dataclasses.replace(
+        trajectory,
+        actions=trajectory.actions[burn_in:],
+        rewards=trajectory.rewards[burn_in:],
+        terminated=trajectory.terminated[burn_in:],
     )
-    multi_step = partial(n_step_targets, n_step=config.n_step)
-    return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
+    returns = partial(n_step_targets, n_step=config.n_step)
+    targets = _targets(learned, bootstrap, discount, returns, config)
+    return _squared_error(online, targets, learned.actions, weights, config)
 
 
 def pqn_loss(
-    params: Params,
-    network: QNetwork,
-    episodes: Episodes,
-    config: LearnerConfig,
-    discount: Array | float | None = None,
+    params: Params, trajectory: Episodes, discount: Array | float, program: Program
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
 
-    The steps are fresh, so the recurrent state they were driven with serves as the first one;
+    The steps are fresh, so the recurrent state they were taken with serves as the first one;
     there is no burn-in, no replay and no target network. Arguments as for `r2d2_loss`.
     """
-    online = _values_after_burn_in(network, params, episodes, 0)
+    config = program.config.learner
+    online = _outputs_after_burn_in(params, trajectory, 0, program.network)
     bootstrap = jax.lax.stop_gradient(online.q_values.max(axis=-1))
-    learned = (episodes.actions, episodes.rewards, episodes.terminated)
-    multi_step = partial(lambda_targets, trace_decay=config.trace_decay)
-    weights = jnp.ones(episodes.rewards.shape[1])
-    return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
+    returns = partial(lambda_targets, trace_decay=config.trace_decay)
+    targets = _targets(trajectory, bootstrap, discount, returns, config)
+    weights = jnp.ones(trajectory.rewards.shape[1])
+    return _squared_error(online, targets, trajectory.actions, weights, config)
 
 
-def _values_after_burn_in(
-    network: QNetwork, params: Params, episodes: Episodes, burn_in_length: int
+def _outputs_after_burn_in(
+    params: Params, trajectory: Episodes, burn_in_length: int, network: QNetwork
 ) -> QOutput:
     """Outputs for the observations from `burn_in_length` on, warmed up on those before."""
-    carry = episodes.carry
+    carry = trajectory.carry
     if burn_in_length > 0:
-        warm_up = jax.tree.map(lambda x: x[:burn_in_length], episodes.obs)
+        warm_up = jax.tree.map(lambda x: x[:burn_in_length], trajectory.obs)
         carry, _ = network.apply(params, warm_up, carry)
         carry = jax.lax.stop_gradient(carry)
-    learned = jax.tree.map(lambda x: x[burn_in_length:], episodes.obs)
+    learned = jax.tree.map(lambda x: x[burn_in_length:], trajectory.obs)
     return cast(QOutput, network.apply(params, learned, carry)[1])
 
 
-def _squared_error(
-    online: QOutput,
+def _targets(
+    trajectory: Episodes,
     bootstrap: Array,
-    learned: tuple[Array, Array, Array],
-    multi_step: Any,
-    weights: Array,
+    discount: Array | float,
+    returns: Callable[[Array, Array, Array], Array],
     config: LearnerConfig,
-    discount: Array | float | None,
+) -> Array:
+    """Targets [T', B] of steps with bootstrap values [T' + 1, B], by `returns` of each sequence."""
+    discounts = discount * (1.0 - trajectory.terminated.astype(jnp.float32))
+    if config.value_rescaling:
+        bootstrap = inverse_rescale(bootstrap)
+    targets = jax.vmap(returns, in_axes=1, out_axes=1)(trajectory.rewards, discounts, bootstrap)
+    return rescale(targets) if config.value_rescaling else targets
+
+
+def _squared_error(
+    online: QOutput, targets: Array, actions: Array, weights: Array, config: LearnerConfig
 ) -> tuple[Array, LossOutput]:
-    """Compare the taken actions' values with targets built from `bootstrap` [T' + 1, B].
+    """Compare the values of the actions taken [T', B] with their targets [T', B].
 
     With advantage learning (Bellemare et al. 2016) each action's target is lowered by a share alpha
     of what the action is worth less than the best one: the gap between them grows by 1 / (1 -
     alpha), and the best action stays the best.
     """
-    actions, rewards, terminated = learned
-    discount = config.discount if discount is None else discount
-    discounts = discount * (1.0 - terminated.astype(jnp.float32))
-    if config.value_rescaling:
-        bootstrap = inverse_rescale(bootstrap)
-    targets = jax.vmap(multi_step, in_axes=1, out_axes=1)(rewards, discounts, bootstrap)
-    if config.value_rescaling:
-        targets = rescale(targets)
     predictions = _pick(online.q_values[:-1], actions)
     if config.advantage_learning > 0:
         targets -= config.advantage_learning * (online.q_values[:-1].max(axis=-1) - predictions)
@@ -146,8 +150,8 @@ def gate_entropy(skill_weights: Array) -> Array:
 
 def skill_distance(skill_q_values: Array) -> Array:
     """How far the skills' Q-values [..., K, A] are apart: mean absolute deviation over skills."""
-    centre = skill_q_values.mean(axis=-2, keepdims=True)
-    return jnp.abs(skill_q_values - centre).mean(axis=(-2, -1))
+    center = skill_q_values.mean(axis=-2, keepdims=True)
+    return jnp.abs(skill_q_values - center).mean(axis=(-2, -1))
 
 
 def _pick(q_values: Array, actions: Array) -> Array:

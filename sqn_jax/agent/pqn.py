@@ -1,65 +1,62 @@
 """Recurrent PQN: many robots, fresh steps, Q(lambda) targets; no replay, no target network.
 
-Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024). The robots drive a
-window of an episode, the network is updated on it, and they drive on with the new network; the
-recurrent state is handed from window to window. Layer normalisation takes the place of the target
+Follows "Simplifying Deep Temporal Difference Learning" (Gallici et al. 2024). The robots act for
+a window of an episode, the network is updated on it, and they go on with the new network; the
+recurrent state is handed from window to window. Layer normalization takes the place of the target
 network.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from jax import Array
 
 from sqn_jax.agent.experience import Episodes
-from sqn_jax.agent.learner import LearnerState, average_params, gradient_step
-from sqn_jax.agent.loss import pqn_loss
-from sqn_jax.agent.networks import QNetwork
-from sqn_jax.config import TrainConfig
+from sqn_jax.agent.learner import LearnerState, average_params, current_discount, gradient_step
+from sqn_jax.agent.loss import LossOutput, pqn_loss
+from sqn_jax.agent.networks import Params
+from sqn_jax.agent.program import Program
 
 
 def learn(
-    key: Array,
-    state: LearnerState,
-    memory: None,
-    episodes: Episodes,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    config: TrainConfig,
-    discount: Array | float | None = None,
-    axis_name: str | None = None,
-) -> tuple[LearnerState, None, dict[str, Array]]:
+    key: Array, state: LearnerState, trajectory: Episodes, program: Program
+) -> tuple[LearnerState, dict[str, Array]]:
     """Go through a window of all robots in minibatches, each robot equally often.
 
     Robot n is in minibatch n mod M, so that each minibatch spans the exploration ladder. Robots
-    are independent of each other: there is nothing to shuffle, and the key is not needed. With the
-    name of an axis of devices, each has its share of the robots and of each minibatch.
+    are independent of each other: there is nothing to shuffle, and the key is not needed. On
+    several devices each has its shard of the robots and of each minibatch.
     """
     del key
-    num_batches = config.num_envs // config.learner.batch_size
-    batches = split_robots(episodes, num_batches)
-    update = partial(
-        _update,
-        network=network,
-        optimizer=optimizer,
-        config=config,
-        discount=discount,
-        axis_name=axis_name,
-    )
+    minibatches = split_robots(trajectory, program.num_minibatches)
 
     def one_pass(state: LearnerState, _: None) -> tuple[LearnerState, dict[str, Array]]:
-        return jax.lax.scan(update, state, batches)
+        return jax.lax.scan(lambda state, part: update(state, part, program), state, minibatches)
 
-    state, metrics = jax.lax.scan(one_pass, state, None, length=config.learner.num_passes)
-    return state, memory, jax.tree.map(jnp.mean, metrics)
+    num_passes = program.config.learner.num_passes
+    state, metrics = jax.lax.scan(one_pass, state, None, length=num_passes)
+    return state, jax.tree.map(jnp.mean, metrics)
 
 
-def split_robots(episodes: Episodes, num_batches: int) -> Episodes:
+def update(
+    state: LearnerState, trajectory: Episodes, program: Program
+) -> tuple[LearnerState, dict[str, Array]]:
+    """Learn from one minibatch [T (+ 1), B, ...]."""
+    discount = current_discount(state, program)
+
+    def loss_function(params: Params) -> tuple[Array, LossOutput]:
+        return pqn_loss(params, trajectory, discount, program)
+
+    state, _, metrics = gradient_step(state, loss_function, program)
+    if state.target_params is not None:
+        state = average_params(state, program.config.learner.average_share)
+    return state, metrics
+
+
+def split_robots(trajectory: Episodes, num_batches: int) -> Episodes:
     """N robots to M minibatches: [T, N, ...] becomes [M, T, N / M, ...], [N, H] [M, N / M, H]."""
 
     def split(array: Array, axis: int) -> Array:
@@ -68,28 +65,9 @@ def split_robots(episodes: Episodes, num_batches: int) -> Episodes:
         return jnp.moveaxis(grouped, axis + 1, 0)
 
     return Episodes(
-        obs=jax.tree.map(partial(split, axis=1), episodes.obs),
-        actions=split(episodes.actions, 1),
-        rewards=split(episodes.rewards, 1),
-        terminated=split(episodes.terminated, 1),
-        carry=split(episodes.carry, 0),
+        obs=jax.tree.map(partial(split, axis=1), trajectory.obs),
+        actions=split(trajectory.actions, 1),
+        rewards=split(trajectory.rewards, 1),
+        terminated=split(trajectory.terminated, 1),
+        carry=split(trajectory.carry, 0),
     )
-
-
-def _update(
-    state: LearnerState,
-    episodes: Episodes,
-    *,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    config: TrainConfig,
-    discount: Array | float | None,
-    axis_name: str | None,
-) -> tuple[LearnerState, dict[str, Array]]:
-    def loss_function(params: Any) -> Any:
-        return pqn_loss(params, network, episodes, config.learner, discount)
-
-    state, _, metrics = gradient_step(state, optimizer, loss_function, axis_name)
-    if state.target_params is not None:
-        state = average_params(state, config.learner.average_share)
-    return state, metrics

@@ -8,23 +8,21 @@ first step on, the recurrent state starts at zero as it did on the robot.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array
 
 from sqn_jax.agent import replay
 from sqn_jax.agent.experience import Episodes
-from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
-from sqn_jax.agent.loss import r2d2_loss
-from sqn_jax.agent.networks import QNetwork
+from sqn_jax.agent.learner import LearnerState, current_discount, gradient_step, update_target
+from sqn_jax.agent.loss import LossOutput, r2d2_loss
+from sqn_jax.agent.networks import Params
+from sqn_jax.agent.program import Program
 from sqn_jax.agent.replay import ReplayState
-from sqn_jax.agent.shares import all_shares
-from sqn_jax.config import TrainConfig
+from sqn_jax.agent.shards import all_shards
 
 
 @struct.dataclass
@@ -41,17 +39,17 @@ class PackedEpisodes:
     """[N, T] bool."""
 
 
-def pack(episodes: Episodes) -> PackedEpisodes:
+def pack(trajectory: Episodes) -> PackedEpisodes:
     """Whole time-major episodes to compact items."""
     compact = PackedEpisodes(
         obs=dataclasses.replace(
-            episodes.obs,
-            ranges=jnp.round(episodes.obs.ranges * 255).astype(jnp.uint8),
-            goal=jnp.round(episodes.obs.goal * 65535).astype(jnp.uint16),
+            trajectory.obs,
+            ranges=jnp.round(trajectory.obs.ranges * 255).astype(jnp.uint8),
+            goal=jnp.round(trajectory.obs.goal * 65535).astype(jnp.uint16),
         ),
-        actions=episodes.actions.astype(jnp.uint8),
-        rewards=episodes.rewards,
-        terminated=episodes.terminated,
+        actions=trajectory.actions.astype(jnp.uint8),
+        rewards=trajectory.rewards,
+        terminated=trajectory.terminated,
     )
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), compact)
 
@@ -72,80 +70,84 @@ def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
     )
 
 
-def packed_item(episodes: Episodes) -> Any:
+def packed_item(trajectory: Episodes) -> Any:
     """Shapes and dtypes of one stored episode, from episodes given as shapes or arrays."""
-    packed = jax.eval_shape(pack, episodes)
+    packed = jax.eval_shape(pack, trajectory)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
 
 
+def init_memory(trajectory: Episodes, program: Program) -> ReplayState:
+    """An empty replay for rounds of N episodes [T (+ 1), N, ...], given as shapes or arrays."""
+    return replay.init(
+        packed_item(trajectory), program.config.replay.capacity, trajectory.actions.shape[1]
+    )
+
+
 def learn(
-    key: Array,
-    state: LearnerState,
-    memory: ReplayState,
-    episodes: Episodes,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    config: TrainConfig,
-    discount: Array | float | None = None,
-    axis_name: str | None = None,
-) -> tuple[LearnerState, ReplayState, dict[str, Array]]:
+    key: Array, state: LearnerState, trajectory: Episodes, program: Program
+) -> tuple[LearnerState, dict[str, Array]]:
     """Store a round of episodes and update, once enough are stored; the key is consumed.
 
-    With the name of an axis of devices, each stores its share of the round and learns from its
-    share of every minibatch; all are given the same key.
+    On several devices each stores its shard of the round and learns from its shard of every
+    minibatch; all are given the same key.
     """
-    memory = replay.add(memory, pack(episodes))
-    update = partial(
-        _update,
-        network=network,
-        optimizer=optimizer,
-        config=config,
-        discount=discount,
-        axis_name=axis_name,
-    )
+    config = program.config
+    memory = replay.add(state.memory, pack(trajectory))
     keys = jax.random.split(key, config.updates_per_round)
 
-    def all_updates(carry: Any) -> tuple[Any, dict[str, Array]]:
-        return jax.lax.scan(update, carry, keys)
+    def all_updates(state: LearnerState) -> tuple[LearnerState, dict[str, Array]]:
+        return jax.lax.scan(lambda state, key: update(key, state, program), state, keys)
 
-    def none(carry: Any) -> tuple[Any, dict[str, Array]]:
-        shapes = jax.eval_shape(all_updates, carry)[1]
-        return carry, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
+    def none(state: LearnerState) -> tuple[LearnerState, dict[str, Array]]:
+        shapes = jax.eval_shape(all_updates, state)[1]
+        return state, jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 
-    ready = memory.size >= config.replay.min_episodes
-    (state, memory), metrics = jax.lax.cond(ready, all_updates, none, (state, memory))
-    return state, memory, jax.tree.map(jnp.mean, metrics)
+    is_ready = memory.size >= config.replay.min_episodes
+    state = dataclasses.replace(state, memory=memory)
+    state, metrics = jax.lax.cond(is_ready, all_updates, none, state)
+    return state, jax.tree.map(jnp.mean, metrics)
 
 
-def _update(
-    carry: tuple[LearnerState, ReplayState],
-    key: Array,
-    *,
-    network: QNetwork,
-    optimizer: optax.GradientTransformation,
-    config: TrainConfig,
-    discount: Array | float | None,
-    axis_name: str | None,
-) -> tuple[tuple[LearnerState, ReplayState], dict[str, Array]]:
-    state, memory = carry
-    settings = config.replay
+def update(
+    key: Array, state: LearnerState, program: Program
+) -> tuple[LearnerState, dict[str, Array]]:
+    """Draw a minibatch, learn from it, and store its new priorities; the key is consumed."""
+    config = program.config.replay
     items, places, weights = replay.sample(
         key,
-        memory,
-        config.learner.batch_size,
-        priority_exponent=settings.priority_exponent if settings.prioritized else 0.0,
-        importance_exponent=settings.importance_exponent if settings.prioritized else 0.0,
-        axis_name=axis_name,
+        state.memory,
+        program.config.learner.batch_size,
+        priority_exponent=config.priority_exponent if config.prioritized else 0.0,
+        importance_exponent=config.importance_exponent if config.prioritized else 0.0,
+        axis_name=program.axis_name,
     )
-    episodes = unpack(items, config.network.hidden_size)
+    trajectory = unpack(items, program.config.network.hidden_size)
+    state, priorities, metrics = learn_from(state, trajectory, weights, program)
+    priorities = all_shards(priorities, program.axis_name)
+    memory = replay.update_priorities(state.memory, places, priorities)
+    return dataclasses.replace(state, memory=memory), metrics
 
-    def loss_function(params: Any) -> Any:
-        return r2d2_loss(
-            params, state.target_params, network, episodes, weights, config.learner, discount
-        )
 
-    state, output, metrics = gradient_step(state, optimizer, loss_function, axis_name)
-    state = update_target(state, config.learner.target_update_rate)
-    priorities = replay.sequence_priorities(output.td_errors, settings.max_priority_weight)
-    priorities = all_shares(priorities, axis_name)
-    return (state, replay.update_priorities(memory, places, priorities)), metrics
+def learn_from(
+    state: LearnerState, trajectory: Episodes, weights: Array, program: Program
+) -> tuple[LearnerState, Array, dict[str, Array]]:
+    """One update from episodes that have been drawn.
+
+    Args:
+        state: the learner.
+        trajectory: [T (+ 1), B, ...] whole episodes.
+        weights: [B] importance-sampling weights.
+        program: of the run.
+
+    Returns:
+        The new state, priorities [B] of the episodes, and scalars worth logging.
+    """
+    discount = current_discount(state, program)
+
+    def loss_function(params: Params) -> tuple[Array, LossOutput]:
+        return r2d2_loss(params, state.target_params, trajectory, weights, discount, program)
+
+    state, output, metrics = gradient_step(state, loss_function, program)
+    state = update_target(state, program.config.learner.target_update_rate)
+    max_weight = program.config.replay.max_priority_weight
+    return state, replay.sequence_priorities(output.td_errors, max_weight), metrics

@@ -1,8 +1,8 @@
 """A ring of whole episodes on the device, drawn by priority. It knows nothing of what it stores.
 
 Everything is a pure function of `ReplayState`. Episodes come in blocks of a fixed size that
-divides the capacity, so that a block is one contiguous write. Several devices each store a share of
-every block; priorities are held by all.
+divides the capacity, so that a block is one contiguous write. Several devices each store a shard of
+every block; all have the priorities.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.shares import own_share, take
+from sqn_jax.agent.shards import own_shard, take
 
 
 @struct.dataclass
@@ -24,7 +24,7 @@ class ReplayState:
     """Stored items and their priorities."""
 
     storage: Any
-    """A pytree of [blocks, N, ...] arrays; each device holds its share of every block."""
+    """A pytree of [blocks, N, ...] arrays; each device has its shard of every block."""
     priorities: Array
     """[capacity] float32, positive; 0 where nothing is stored. Item n of block b has the place
     b N + n."""
@@ -65,7 +65,7 @@ def num_bytes(example: Any, capacity: int) -> int:
 def add(state: ReplayState, items: Any) -> ReplayState:
     """Store a block of N items [N, ...], over the oldest once full.
 
-    On several devices each is given its own share of the block.
+    On several devices each is given its own shard of the block.
     """
     chex.assert_trees_all_equal_shapes_and_dtypes(
         items, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state.storage)
@@ -92,7 +92,7 @@ def _block(state: ReplayState) -> int:
 
 
 def probabilities(state: ReplayState, exponent: float) -> Array:
-    """Chance of each place to be drawn, [capacity]: proportional to priority ** exponent."""
+    """Probability of each place to be drawn, [capacity]: proportional to priority ** exponent."""
     stored = jnp.arange(state.priorities.shape[0]) < state.size
     weights = jnp.where(stored, state.priorities**exponent, 0.0)
     return weights / weights.sum()
@@ -114,25 +114,25 @@ def sample(
         state: with at least one item.
         batch_size: items to draw.
         priority_exponent: 0 draws uniformly.
-        importance_exponent: 0 leaves the bias of prioritised drawing uncorrected.
-        axis_name: of the devices that share the storage; all are given the same key.
+        importance_exponent: 0 leaves the bias of prioritized drawing uncorrected.
+        axis_name: of the devices that the storage is divided between; all are given the same key.
 
     Returns:
         Items [B, ...], their places [B] int32, and importance weights [B] in (0, 1], scaled by
-        their largest. With several devices, all places but only the own share of items and weights.
+        their largest. With several devices, all places but only the own shard of items and weights.
     """
-    chance = probabilities(state, priority_exponent)
-    cumulative = jnp.cumsum(chance)
+    probability = probabilities(state, priority_exponent)
+    cumulative = jnp.cumsum(probability)
     draws = jax.random.uniform(key, (batch_size,)) * cumulative[-1]
     places = (cumulative[None] <= draws[:, None]).sum(axis=1, dtype=jnp.int32)
     places = jnp.minimum(places, state.size - 1)
     items = take(state.storage, *jnp.divmod(places, _block(state)), axis_name)
-    weights = (state.size * chance[places]) ** -importance_exponent
-    return items, places, own_share(weights / weights.max(), axis_name)
+    weights = (state.size * probability[places]) ** -importance_exponent
+    return items, places, own_shard(weights / weights.max(), axis_name)
 
 
 def update_priorities(state: ReplayState, places: Array, priorities: Array) -> ReplayState:
-    """Set the priorities [B] of places [B]; of a place drawn twice, one of the two holds.
+    """Set the priorities [B] of places [B]; of a place drawn twice, one of the two.
 
     A priority that is not finite leaves the place the one it has.
     """

@@ -117,3 +117,8 @@ class TrainConfig:
     def num_chunks(self) -> int:
         """Calls of the compiled program in the whole run."""
         return self.num_rounds // self.rounds_per_chunk
+
+    @property
+    def averages_params(self) -> bool:
+        """Whether the policy is an average of the parameters over the last updates."""
+        return self.method == "pqn" and self.learner.average_share > 0

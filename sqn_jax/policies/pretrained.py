@@ -20,8 +20,9 @@ from flax import traverse_util
 
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
-from sqn_jax.policies.run_policies import Policy, load_policy, params_shapes
+from sqn_jax.policies.run_policies import Policy, load_policy
 from sqn_jax.storage.files import write_json
+from sqn_jax.training.state import params_shapes
 
 PREFIX = "pretrained:"
 SUFFIX = ".npz"

@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from sqn_jax import config as configs
-from sqn_jax.agent.networks import Params, initial_carry
+from sqn_jax.agent.networks import Params
 from sqn_jax.config import TrainConfig
-from sqn_jax.env import Observation
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
-from sqn_jax.training.loop import RunnerState, averages, network_of
+from sqn_jax.training.state import RunnerState, params_shapes
 
 
 @dataclass(frozen=True)
@@ -34,24 +33,6 @@ class Policy:
     def training_seeds(self) -> tuple[int, ...]:
         """The seeds, in the order of `params`."""
         return tuple(self.config.seed + index for index in range(self.config.num_seeds))
-
-
-def params_shapes(config: TrainConfig) -> Params:
-    """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
-
-    They follow from the config alone: the map need not be at hand.
-    """
-    goal_size = 2 if config.env.heading_encoding == "linear" else 3
-    obs = Observation(
-        ranges=jnp.zeros((1, 1, config.env.num_beams)), goal=jnp.zeros((1, 1, goal_size))
-    )
-    carry = initial_carry(config.network, 1)
-    shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
-    if config.num_seeds == 1:
-        return shapes
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((config.num_seeds, *x.shape), x.dtype), shapes
-    )
 
 
 def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
@@ -72,7 +53,7 @@ def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
         raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
     with Checkpoints(run_dir, Origin(config)) as checkpoints:
         params = checkpoints.restore_policy(
-            params_shapes(config), averaged=averages(config), which=checkpoint
+            params_shapes(config), averaged=config.averages_params, which=checkpoint
         )
     return Policy(run_dir.resolve().name, config, seeds_of(params, config))
 

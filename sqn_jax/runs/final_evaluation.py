@@ -7,14 +7,15 @@ from typing import Any
 import jax
 
 import sqn_jax
+from sqn_jax.agent.learner import policy_params
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices
-from sqn_jax.training.loop import RunnerState, policy_params
 from sqn_jax.training.rollout import EpisodeSummary, Trace
+from sqn_jax.training.state import RunnerState
 
 Drawn = dict[str, tuple[EpisodeSummary, Trace]]
 """For each kind of task, the episodes of the first seed."""
@@ -108,7 +109,7 @@ def conclude(
         "compile_seconds": round(timing["compile_seconds"], 1),
         "compiled_earlier": bool(timing["compiled_earlier"]),
         "steps_per_second": round(timing["env_steps"] / max(timing["train_seconds"], 1e-9)),
-        "device": devices.words(),
+        "device": devices.describe(),
         "num_devices": timing["num_devices"],
         "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
     }

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax.sharding import Mesh
 
+from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import load_map
@@ -34,16 +34,16 @@ from sqn_jax.storage.manifest import Manifest, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder
 from sqn_jax.training import devices, memory_budget
 from sqn_jax.training.loop import (
-    ChunkProgram,
     ChunkReport,
-    RunnerState,
+    CompiledChunk,
     compile_chunk,
-    memory_bytes,
-    num_windows,
+    make_program,
+    rounds_done,
     run,
     runner_shapes,
     start_run,
 )
+from sqn_jax.training.state import RunnerState, memory_bytes
 
 
 @kept_programs()
@@ -79,9 +79,9 @@ def train_session(
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     # Refuses a window that does not fit before anything is written.
-    num_windows(config, env_params)
-    held = memory_bytes(config, env_params)
-    memory_budget.require(held, "keeping its episodes", config.method)
+    program = make_program(env_params, config, mesh)
+    num_bytes = memory_bytes(env_params, program)
+    memory_budget.require(num_bytes, "keeping its episodes", config.method)
     if tensorboard:
         require_tensorboard()
     origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
@@ -89,13 +89,13 @@ def train_session(
         stack.enter_context(locked(run_dir))
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
-        runner = _restored(env_params, config, mesh, folder, checkpoints) if resume else None
-        _announce(config, env_params, run_dir, mesh, held)
-        done = 0 if runner is None else _rounds_done(runner) * config.num_envs
+        runner = _restored(env_params, program, folder, checkpoints) if resume else None
+        _announce(program, run_dir, num_bytes)
+        done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
         if runner is None and resume:
             start = _starting_policy(config)
-        training = _Training(env_params, config, mesh, folder, checkpoints, start)
+        training = _Training(env_params, program, folder, checkpoints, start)
         runner = training.drive(runner, None if board is None else board.scalars)
         if occupancy_map.tiles != (1, 1):
             first = config.maps.names[0]
@@ -117,9 +117,8 @@ def _starting_policy(config: TrainConfig) -> Policy | None:
     return policy
 
 
-def _announce(
-    config: TrainConfig, env_params: EnvParams, run_dir: Path, mesh: Mesh | None, held: int
-) -> None:
+def _announce(program: Program, run_dir: Path, num_bytes: int) -> None:
+    config = program.config
     seeds = f"seed {config.seed}"
     if config.num_seeds > 1:
         seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
@@ -127,29 +126,26 @@ def _announce(
     start = f"starting from {config.start_from}\n" if config.start_from else ""
     print(
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
-        f"{episodes:,} episodes of {env_params.max_steps} steps, {config.num_envs} robots at once\n"
-        f"{start}run folder {run_dir}, device {devices.words(mesh)}, "
-        f"episodes in memory {held / 1e6:,.1f} MB"
+        f"{episodes:,} episodes of {program.max_steps} steps, {config.num_envs} robots at once\n"
+        f"{start}run folder {run_dir}, device {devices.describe(program.mesh)}, "
+        f"episodes in memory {num_bytes / 1e6:,.1f} MB"
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
         print("checkpoints without the replay: a run that is stopped does not go on exactly")
 
 
 def _restored(
-    env_params: EnvParams,
-    config: TrainConfig,
-    mesh: Mesh | None,
-    folder: RunFolder,
-    checkpoints: Checkpoints,
+    env_params: EnvParams, program: Program, folder: RunFolder, checkpoints: Checkpoints
 ) -> RunnerState | None:
     """The state to go on from; None if the run was stopped before its first checkpoint.
 
     From here on the folder is that of a run with this config, as far as it has come.
     """
+    config = program.config
     runner, chunks = None, 0
     if checkpoints.chunks():
-        runner, told = checkpoints.restore(runner_shapes(env_params, config, mesh))
-        chunks = _rounds_done(runner) // config.rounds_per_chunk
+        runner, saved = checkpoints.restore(runner_shapes(env_params, program))
+        chunks = rounds_done(runner) // config.rounds_per_chunk
         if chunks > config.num_chunks:
             episodes = chunks * config.rounds_per_chunk * config.num_envs
             raise ValueError(
@@ -157,11 +153,12 @@ def _restored(
                 f"the run in {folder.path} has behind it"
             )
         print(f"resuming after {chunks} of {config.num_chunks} chunks")
-        _compare_makes(told, mesh)
-        if config.method == "r2d2" and runner.memory is None:
+        _compare_makes(saved, 1 if program.mesh is None else program.mesh.size)
+        if config.method == "r2d2" and runner.learner.memory is None:
             print("saved without the replay: going on from an empty one, not exactly as before")
-            fresh = start_run(env_params, config, mesh)
-            runner = dataclasses.replace(runner, memory=fresh.memory)
+            memory = start_run(env_params, program).learner.memory
+            learner = dataclasses.replace(runner.learner, memory=memory)
+            runner = dataclasses.replace(runner, learner=learner)
     else:
         _require_none_lost(folder, config)
         print("stopped before its first checkpoint: starting from the beginning")
@@ -193,12 +190,11 @@ def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
         )
 
 
-def _compare_makes(told: Manifest, mesh: Mesh | None) -> None:
+def _compare_makes(saved: Manifest, num_devices: int) -> None:
     """Say so where another machine or version goes on: the run is then not the same to the bit."""
-    count = 1 if mesh is None else mesh.size
-    then = {**told.contents["versions"], "device": told.contents["device"]}
-    now = {**manifest.versions(), "device": devices.words()}
-    then["devices"], now["devices"] = str(told.contents["num_devices"]), str(count)
+    then = {**saved.contents["versions"], "device": saved.contents["device"]}
+    now = {**manifest.versions(), "device": devices.describe()}
+    then["devices"], now["devices"] = str(saved.contents["num_devices"]), str(num_devices)
     changed = [name for name in ("jax", "device", "devices", "sqn_jax") if then[name] != now[name]]
     if changed:
         was = ", ".join(f"{name} {then[name]}" for name in changed)
@@ -212,13 +208,13 @@ class _Training:
     def __init__(
         self,
         env_params: EnvParams,
-        config: TrainConfig,
-        mesh: Mesh | None,
+        program: Program,
         folder: RunFolder,
         checkpoints: Checkpoints,
         start: Policy | None,
     ) -> None:
-        self._env_params, self._config, self._mesh = env_params, config, mesh
+        config, mesh = program.config, program.mesh
+        self._env_params, self._program, self._config = env_params, program, config
         self._start = start
         self._folder, self._checkpoints = folder, checkpoints
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
@@ -237,19 +233,19 @@ class _Training:
     ) -> RunnerState:
         """From a state, or from the beginning, to the end; returns the final state."""
         config = self._config
-        done = 0 if runner is None else _rounds_done(runner)
+        done = 0 if runner is None else rounds_done(runner)
         self.timing["env_steps"] = done * self._steps_a_round
         if runner is not None and done >= config.num_rounds:
             return runner
-        program = self._compile()
+        compiled = self._compile()
         if runner is None:
-            runner = start_run(self._env_params, config, self._mesh)
+            runner = start_run(self._env_params, self._program)
             if self._start is not None:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
         saving = "stopping after this chunk and saving"
         with collected(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
-            for runner, report in run(runner, self._env_params, config, program, self._mesh):  # noqa: B020
+            for runner, report in run(runner, self._env_params, self._program, compiled):  # noqa: B020
                 row = self._keep(report)
                 if on_row is not None:
                     on_row(row)
@@ -265,24 +261,24 @@ class _Training:
             raise Interrupted(received[0])
         return runner
 
-    def _compile(self) -> ChunkProgram:
+    def _compile(self) -> CompiledChunk:
         """Compile, and refuse what does not fit."""
         print("compiling ...", end="", flush=True)
         with watched_compilation() as was_read:
-            program, seconds = compile_chunk(self._env_params, self._config, self._mesh)
+            compiled, seconds = compile_chunk(self._env_params, self._program)
         self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
         how = "compiled earlier, read" if was_read() else "compiled"
         print(f"\r{how} in {seconds:.1f} s")
-        needed = memory_budget.program_bytes(program)
+        needed = memory_budget.compiled_bytes(compiled)
         memory_budget.require(needed, "training", self._config.method)
-        return program
+        return compiled
 
     def _keep(self, report: ChunkReport) -> dict[str, Any]:
         """Count a chunk and write its row."""
         self.timing["train_seconds"] += report.seconds
         self.timing["env_steps"] += self._config.rounds_per_chunk * self._steps_a_round
         self._successes.append(float(np.mean(report.metrics["success"])))
-        row = _row(report, self.timing["train_seconds"], self._env_params, self._config)
+        row = _row(report, self.timing["train_seconds"], self._program)
         self._folder.append_metrics(row)
         return row
 
@@ -296,21 +292,16 @@ class _Training:
         self._saved_at = time.monotonic()
 
 
-def _rounds_done(runner: RunnerState) -> int:
-    return int(np.max(np.asarray(runner.round)))
-
-
-def _row(
-    report: ChunkReport, train_seconds: float, env_params: EnvParams, config: TrainConfig
-) -> dict[str, Any]:
+def _row(report: ChunkReport, train_seconds: float, program: Program) -> dict[str, Any]:
     """One line of metrics.jsonl."""
+    config = program.config
     rounds = report.chunk * config.rounds_per_chunk
     episodes = rounds * config.num_envs
-    steps = config.rounds_per_chunk * config.num_envs * config.num_seeds * env_params.max_steps
+    steps = config.rounds_per_chunk * config.num_envs * config.num_seeds * program.max_steps
     return {
         "chunk": report.chunk,
         "episodes": episodes,
-        "env_steps": episodes * env_params.max_steps,
+        "env_steps": episodes * program.max_steps,
         "wall_seconds": round(train_seconds, 3),
         "steps_per_second": round(steps / report.seconds),
         **report.metrics,

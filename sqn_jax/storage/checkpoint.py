@@ -30,7 +30,7 @@ from sqn_jax.storage import manifest
 from sqn_jax.storage.files import flush_to_disk
 from sqn_jax.storage.manifest import Damaged, Manifest, Mismatch, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS
-from sqn_jax.training.loop import RunnerState
+from sqn_jax.training.state import RunnerState
 
 KEPT = 2
 """How many of the newest are kept; the best one besides."""
@@ -136,7 +136,7 @@ class Checkpoints:
         Args:
             params_shapes: the parameters as arrays or structs.
             averaged: whether the run's policy is the average of its parameters, see
-                `loop.averages`.
+                `TrainConfig.averages_params`.
             which: "newest", "best" (by success in training) or a number of chunks.
 
         Raises:
@@ -284,16 +284,17 @@ def _flush_folder(folder: Path) -> None:
 
 def _split(runner: RunnerState) -> dict[str, Any]:
     """Parameters, their slow copy, replay, and all else as plain trees; keys as raw numbers."""
+    learner = runner.learner
     items = {
-        "params": runner.learner.params,
-        "target_params": runner.learner.target_params,
-        "memory": runner.memory,
+        "params": learner.params,
+        "target_params": learner.target_params,
+        "memory": learner.memory,
         "rest": {
-            "opt_state": runner.learner.opt_state,
-            "num_updates": runner.learner.num_updates,
-            "num_skipped": runner.learner.num_skipped,
+            "opt_state": learner.opt_state,
+            "num_updates": learner.num_updates,
+            "num_skipped": learner.num_skipped,
             "key": _key_data(runner.key),
-            "round": runner.round,
+            "round": learner.round,
         },
     }
     return {name: item for name, item in items.items() if item is not None}
@@ -317,17 +318,13 @@ def _key_data(key: Any) -> Any:
 
 def _join(items: Any) -> RunnerState:
     rest = items["rest"]
-    held = {name: items[name] for name in items.keys()}  # noqa: SIM118, it is no dict.
+    optional = {name: items.get(name) for name in ("target_params", "memory")}
     learner = LearnerState(
         params=items["params"],
-        target_params=held.get("target_params"),
+        **optional,
         opt_state=rest["opt_state"],
+        round=rest["round"],
         num_updates=rest["num_updates"],
         num_skipped=rest["num_skipped"],
     )
-    return RunnerState(
-        learner=learner,
-        memory=held.get("memory"),
-        key=jax.random.wrap_key_data(rest["key"]),
-        round=rest["round"],
-    )
+    return RunnerState(learner=learner, key=jax.random.wrap_key_data(rest["key"]))

@@ -116,7 +116,7 @@ def write(
         "score": score,
         "config": configs.to_dict(origin.config),
         "world": origin.world,
-        "device": devices.words(),
+        "device": devices.describe(),
         "num_devices": origin.num_devices,
         "versions": versions(),
         "leaves": {

@@ -1,8 +1,8 @@
-"""One run on several devices: each drives its share of the robots and learns from it.
+"""One run on several devices: each steps its shard of the robots and learns from it.
 
-Robots, minibatches and the replay's episodes are divided evenly; parameters are held by all, and
-gradients averaged. What a robot does and which episodes are drawn does not depend on the number of
-devices: a seed gives the same run, to the rounding of sums.
+Robots, minibatches and the replay's episodes are divided evenly; each device has all parameters,
+and gradients are averaged. What a robot does and which episodes are drawn does not depend on the
+number of devices: a seed gives the same run, to the rounding of sums.
 
 The cores of a CPU count as devices of their own (`use_cores`). One XLA program on two cores splits
 every small loop between them and waits for both; two programs side by side wait for each other once
@@ -21,15 +21,13 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from sqn_jax.agent.shards import AXIS
 from sqn_jax.config import TrainConfig
 
-AXIS = "devices"
-"""Name of the axis that shares are taken along, for `jax.lax.pmean` and its kind."""
-
-WHOLE = PartitionSpec()
+REPLICATED = PartitionSpec()
 """Each device gets all of an array."""
 
-SMALLEST_SHARE = 8
+SMALLEST_SHARD = 8
 """Robots of a minibatch below which another device is not worth it."""
 
 
@@ -38,8 +36,8 @@ def use_cores() -> None:
 
     A number that the user has set (`JAX_NUM_CPU_DEVICES`, `XLA_FLAGS`) is left as it is.
     """
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if told or jax.config.jax_num_cpu_devices > 0:  # type: ignore[attr-defined]
+    is_set = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if is_set or jax.config.jax_num_cpu_devices > 0:  # type: ignore[attr-defined]
         return
     try:
         jax.config.update("jax_num_cpu_devices", num_cores())
@@ -85,8 +83,8 @@ def require(kind: str | None) -> None:
     try:
         found = jax.devices()[0].platform
     except RuntimeError as error:
-        told = " ".join(str(error).split())[:200]
-        raise ValueError(f"JAX finds no device as it is set up here ({told})") from None
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"JAX finds no device as it is set up here ({reason})") from None
     if kind is not None and found != kind:
         raise ValueError(f"--device is {kind}, expected one that JAX finds here: {found}")
     if kind is None and found == "cpu" and not os.environ.get("JAX_PLATFORMS") and _has_nvidia():
@@ -101,7 +99,7 @@ def _has_nvidia() -> bool:
     return Path("/dev/nvidia0").exists()
 
 
-def words(mesh: Mesh | None = None) -> str:
+def describe(mesh: Mesh | None = None) -> str:
     """What computes: the kind of device, and how many of them."""
     device = jax.devices()[0]
     kind = cpu_model() if device.platform == "cpu" else device.device_kind
@@ -132,7 +130,7 @@ def choose(config: TrainConfig, wanted: int | None = None) -> Mesh | None:
     Args:
         config: the run.
         wanted: how many. By default as many cores of a CPU as leave each at least
-            `SMALLEST_SHARE` robots of a minibatch, and one accelerator.
+            `SMALLEST_SHARD` robots of a minibatch, and one accelerator.
 
     Raises:
         ValueError: there are not as many, or the robots cannot be divided evenly.
@@ -140,17 +138,17 @@ def choose(config: TrainConfig, wanted: int | None = None) -> Mesh | None:
     available = jax.devices()
     if wanted is None:
         most = len(available) if available[0].platform == "cpu" else 1
-        worth = range(1, min(most, config.learner.batch_size // SMALLEST_SHARE) + 1)
+        worth = range(1, min(most, config.learner.batch_size // SMALLEST_SHARD) + 1)
         count = max((n for n in worth if _divides(n, config)), default=1)
     else:
         count = wanted
         _require(1 <= count <= len(available), count, f"1 to {len(available)} of this machine")
         sizes = f"num_envs ({config.num_envs}) and learner.batch_size ({config.learner.batch_size})"
         _require(_divides(count, config), count, f"a divisor of {sizes}")
-    return first(count)
+    return first_devices(count)
 
 
-def first(count: int) -> Mesh | None:
+def first_devices(count: int) -> Mesh | None:
     """The first devices that there are, at least `count`; None stands for one alone."""
     if count == 1:
         return None
@@ -159,7 +157,7 @@ def first(count: int) -> Mesh | None:
 
 def one_and_all() -> list[Mesh | None]:
     """One device alone and, where there are several, all of them: what a benchmark compares."""
-    return [first(count) for count in sorted({1, len(jax.devices())})]
+    return [first_devices(count) for count in sorted({1, len(jax.devices())})]
 
 
 def _divides(count: int, config: TrainConfig) -> bool:
@@ -171,7 +169,7 @@ def _require(condition: bool, value: int, expected: str) -> None:
         raise ValueError(f"--num-devices is {value}, expected {expected}")
 
 
-def place(tree: Any, mesh: Mesh | None, specs: Any = WHOLE) -> Any:
+def place(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
     """Arrays on the devices of a mesh.
 
     Args:
@@ -182,7 +180,7 @@ def place(tree: Any, mesh: Mesh | None, specs: Any = WHOLE) -> Any:
     return tree if mesh is None else jax.device_put(tree, _shardings(mesh, specs))
 
 
-def placed_shapes(shapes: Any, mesh: Mesh | None, specs: Any = WHOLE) -> Any:
+def placed_shapes(shapes: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
     """Shapes of the arrays that `place` would return for arrays of these shapes."""
     if mesh is None:
         return shapes

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-KNOBS = {
+SETTINGS = {
     "r2d2": ("replay.capacity", "num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
     "pqn": ("num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
 }
@@ -21,7 +21,7 @@ def require(num_bytes: float, what: str, method: str) -> None:
 
     Args:
         num_bytes: that will be allocated.
-        what: for, in words.
+        what: what will be allocated for, "training" say.
         method: of the run, whose settings are named.
 
     Raises:
@@ -29,23 +29,23 @@ def require(num_bytes: float, what: str, method: str) -> None:
     """
     free = available_bytes()
     if free is not None and num_bytes > free:
-        knobs = ", ".join(f"--{name.replace('_', '-')}" for name in KNOBS[method])
+        settings = ", ".join(f"--{name.replace('_', '-')}" for name in SETTINGS[method])
         raise ValueError(
             f"{what} would take {num_bytes / 1e9:,.1f} GB, but {free / 1e9:,.1f} GB are free on "
-            f"{jax.devices()[0].device_kind}: lower one of {knobs}"
+            f"{jax.devices()[0].device_kind}: lower one of {settings}"
         )
 
 
-def program_bytes(program: Any) -> float:
+def compiled_bytes(compiled: Any) -> float:
     """What a compiled program takes while it runs: arguments, results and all in between."""
-    told = program.memory_analysis()
-    if told is None:  # Some backends do not say.
+    analysis = compiled.memory_analysis()
+    if analysis is None:  # Some backends do not say.
         return 0.0
     return float(
-        told.argument_size_in_bytes
-        + told.output_size_in_bytes
-        + told.temp_size_in_bytes
-        - told.alias_size_in_bytes
+        analysis.argument_size_in_bytes
+        + analysis.output_size_in_bytes
+        + analysis.temp_size_in_bytes
+        - analysis.alias_size_in_bytes
     )
 
 
@@ -53,12 +53,12 @@ def available_bytes() -> float | None:
     """Bytes that can still be allocated where a run would be; None where nobody knows."""
     device = jax.devices()[0]
     if device.platform != "cpu":
-        told = device.memory_stats() or {}
-        if "bytes_limit" not in told:
+        stats = device.memory_stats() or {}
+        if "bytes_limit" not in stats:
             return None
-        return float(told["bytes_limit"] - told.get("bytes_in_use", 0))
-    found = [free for free in (_free_of_machine(), _free_of_group()) if free is not None]
-    return min(found) if found else None
+        return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
+    limits = [free for free in (_free_of_machine(), _free_of_group()) if free is not None]
+    return min(limits) if limits else None
 
 
 def _free_of_machine() -> float | None:

@@ -14,7 +14,7 @@ from jax import Array
 from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import draw_exploration, epsilon_greedy
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
-from sqn_jax.agent.shares import own_share
+from sqn_jax.agent.shards import own_shard
 from sqn_jax.config import RandomizationConfig
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
@@ -58,9 +58,9 @@ class Fleet:
 def own_worlds(
     env_params: EnvParams, config: RandomizationConfig, num_envs: int, axis_name: str | None
 ) -> EnvParams:
-    """The worlds of N robots, or of this device's share of them."""
+    """The worlds of N robots, or of this device's shard of them."""
     worlds = randomized(env_params, config, num_envs)
-    own = {name: own_share(getattr(worlds, name), axis_name) for name in robots_own(worlds)}
+    own = {name: own_shard(getattr(worlds, name), axis_name) for name in robots_own(worlds)}
     return dataclasses.replace(worlds, **own)
 
 

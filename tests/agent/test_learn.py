@@ -11,11 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from learning_oracle import adam_step
-from small_problems import HIDDEN, of_robots, random_episodes, random_params, small_network
+from small_problems import (
+    HIDDEN,
+    NUM_ACTIONS,
+    of_robots,
+    random_episodes,
+    random_params,
+    small_network,
+)
 
 from sqn_jax.agent import Episodes, pqn, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, discount_schedule, make_optimizer
+from sqn_jax.agent.learner import LearnerState, discount_schedule
 from sqn_jax.agent.loss import pqn_loss, r2d2_loss
+from sqn_jax.agent.program import Program, make_optimizer
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 
 LENGTH = 5
@@ -25,6 +33,7 @@ METRICS = {"loss", "gradient_norm", "mean_q", "gate_entropy", "skill_distance"}
 
 
 def config_for(method: str, **changes: Any) -> TrainConfig:
+    """Two rounds of six robots."""
     learner = {
         "batch_size": 2,
         "learning_rate": 0.01,
@@ -36,8 +45,9 @@ def config_for(method: str, **changes: Any) -> TrainConfig:
         **changes.pop("learner", {}),
     }
     settings: dict[str, Any] = {
+        "algo": "r2d2",
         "method": method,
-        "total_episodes": 60,
+        "total_episodes": 12,
         "num_envs": 6,
         "updates_per_round": 6,
         "network": NetworkConfig(hidden_size=HIDDEN),
@@ -47,17 +57,25 @@ def config_for(method: str, **changes: Any) -> TrainConfig:
     return TrainConfig(**settings, learner=LearnerConfig(**learner))
 
 
-def optimizer_for(config: TrainConfig) -> Any:
-    return make_optimizer(config.learner, total_updates=10)
+HALFWAY = {"discount_start": 0.36, "discount": 0.75}
+"""After one of two rounds the discount is 1 - sqrt(0.64 x 0.25) = 0.6."""
 
 
-def fresh_state(config: TrainConfig, seed: int, *, use_target: bool) -> LearnerState:
+def program_for(config: TrainConfig) -> Program:
+    return Program(config, LENGTH, NUM_ACTIONS)
+
+
+def fresh_state(
+    config: TrainConfig, seed: int, *, use_target: bool, memory: Any = None, rounds: int = 0
+) -> LearnerState:
     rng = np.random.default_rng(seed)
     params = random_params(NETWORK, rng)
     return LearnerState(
         params=params,
         target_params=random_params(NETWORK, rng) if use_target else None,
-        opt_state=optimizer_for(config).init(params),
+        opt_state=program_for(config).optimizer.init(params),
+        memory=memory,
+        round=jnp.int32(rounds),
         num_updates=jnp.int32(0),
         num_skipped=jnp.int32(0),
     )
@@ -65,16 +83,14 @@ def fresh_state(config: TrainConfig, seed: int, *, use_target: bool) -> LearnerS
 
 def learn_with(method: Any, config: TrainConfig) -> Any:
     """The learn function of a method with everything static bound, compiled."""
-    return jax.jit(
-        partial(method.learn, network=NETWORK, optimizer=optimizer_for(config), config=config)
-    )
+    return jax.jit(partial(method.learn, program=program_for(config)))
 
 
 class HandMadeAdam:
-    """The optimiser of a config in NumPy: linear decay over 10 updates, clipping, Adam."""
+    """The optimizer of a config in NumPy: linear decay over its updates, clipping, Adam."""
 
-    def __init__(self, config: TrainConfig, params: Any) -> None:
-        self.config = config.learner
+    def __init__(self, config: TrainConfig, params: Any, total_updates: int) -> None:
+        self.config, self.total_updates = config.learner, total_updates
         leaves, self.tree = jax.tree.flatten(params)
         self.leaves = [np.asarray(leaf, np.float64) for leaf in leaves]
         self.moments = [(np.zeros_like(leaf), np.zeros_like(leaf)) for leaf in self.leaves]
@@ -91,7 +107,7 @@ class HandMadeAdam:
         self.norms.append(np.sqrt(sum((leaf**2).sum() for leaf in gradients)))
         rate = self.config.learning_rate
         if self.config.learning_rate_schedule == "linear":
-            rate *= 1 - self.count / 10
+            rate *= 1 - self.count / self.total_updates
         self.count += 1
         self.leaves, self.moments = adam_step(
             self.leaves,
@@ -110,18 +126,16 @@ def assert_same_params(ours: Any, by_hand: Any, rate: float) -> None:
 
 
 def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
-    config = config_for("pqn", learner={"num_passes": 2})
-    state = fresh_state(config, 30, use_target=False)
+    config = config_for("pqn", learner={"num_passes": 2, **HALFWAY})
+    state = fresh_state(config, 30, use_target=False, rounds=1)
     episodes = random_episodes(np.random.default_rng(31), LENGTH, 6)
-    # The discount of the moment is not the configured one.
-    new_state, memory, metrics = learn_with(pqn, config)(
-        jax.random.key(0), state, None, episodes, discount=jnp.float32(0.6)
-    )
-    now = dataclasses.replace(config.learner, discount=0.6)
+    new_state, metrics = learn_with(pqn, config)(jax.random.key(0), state, episodes)
+    program = program_for(config)
     slope = jax.jit(
-        jax.value_and_grad(lambda params, part: pqn_loss(params, NETWORK, part, now)[0])
+        jax.value_and_grad(lambda params, part: pqn_loss(params, part, 0.6, program)[0])
     )
-    adam, losses = HandMadeAdam(config, state.params), []
+    # Two rounds of two passes through three minibatches.
+    adam, losses = HandMadeAdam(config, state.params, total_updates=12), []
     # Six robots in minibatches of two: robots 0 and 3, 1 and 4, 2 and 5; then once more.
     for first in (0, 1, 2, 0, 1, 2):
         robots = np.array([first, first + 3])
@@ -130,7 +144,7 @@ def test_pqn_takes_every_minibatch_of_every_pass_as_done_by_hand() -> None:
         adam.update(gradient)
     assert min(adam.norms) < MAX_NORM < max(adam.norms), "clipping is to be seen on and off"
     assert_same_params(new_state.params, adam.params, 0.01)
-    assert memory is None
+    assert new_state.memory is None
     assert new_state.target_params is None
     assert int(new_state.num_updates) == 6
     assert set(metrics) == METRICS
@@ -144,17 +158,14 @@ def test_pqn_hands_out_the_average_of_its_latest_parameters(share: float) -> Non
     state = fresh_state(config, 34, use_target=True)
     episodes = random_episodes(np.random.default_rng(35), LENGTH, 6)
     learn = learn_with(pqn, config)
-    averaged = learn(jax.random.key(0), state, None, episodes)[0]
+    averaged = learn(jax.random.key(0), state, episodes)[0]
     # The average must not steer the learning; without it the same parameters come out.
     plain = dataclasses.replace(state, target_params=None)
     alone = learn_with(pqn, config_for("pqn", learner={"num_passes": 2}))
-    assert_same_params(
-        averaged.params, alone(jax.random.key(0), plain, None, episodes)[0].params, 0.01
-    )
-    slope = jax.jit(
-        jax.grad(lambda params, part: pqn_loss(params, NETWORK, part, config.learner)[0])
-    )
-    adam = HandMadeAdam(config, state.params)
+    assert_same_params(averaged.params, alone(jax.random.key(0), plain, episodes)[0].params, 0.01)
+    program, discount = program_for(config), config.learner.discount
+    slope = jax.jit(jax.grad(lambda params, part: pqn_loss(params, part, discount, program)[0]))
+    adam = HandMadeAdam(config, state.params, total_updates=12)
     history = []
     for first in (0, 1, 2, 0, 1, 2):
         adam.update(slope(adam.params, of_robots(episodes, np.array([first, first + 3]))))
@@ -179,7 +190,7 @@ def test_pqn_sees_every_episode_equally_often(
     episodes = random_episodes(np.random.default_rng(33), LENGTH, 6)
     seen: list[list[int]] = []
 
-    def note_robots(params: Any, network: Any, part: Episodes, *_: Any) -> None:
+    def note_robots(params: Any, part: Episodes, *_: Any) -> None:
         assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
         # Rewards are random, so that they tell which robot's they are.
         same = np.asarray(part.rewards[:, :, None] == episodes.rewards[:, None]).all(axis=0)
@@ -187,14 +198,14 @@ def test_pqn_sees_every_episode_equally_often(
         np.testing.assert_array_equal(part.carry, episodes.carry[np.array(robots)])
         seen.append(robots)
 
-    def no_step(state: Any, optimizer: Any, loss_function: Any, axis_name: Any) -> Any:
+    def no_step(state: Any, loss_function: Any, program: Any) -> Any:
         loss_function(state.params)
         return state, None, {"loss": jnp.float32(0)}
 
     monkeypatch.setattr(pqn, "pqn_loss", note_robots)
     monkeypatch.setattr(pqn, "gradient_step", no_step)
     with jax.disable_jit():
-        pqn.learn(jax.random.key(0), state, None, episodes, NETWORK, optimizer_for(config), config)
+        pqn.learn(jax.random.key(0), state, episodes, program_for(config))
     assert len(seen) == num_passes * 6 // batch_size
     times = np.bincount(np.concatenate(seen), minlength=6)
     assert times.tolist() == [num_passes] * 6
@@ -212,13 +223,12 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
         return items, jnp.asarray(drawn), jnp.asarray(weights, jnp.float32)
 
     monkeypatch.setattr(r2d2.replay, "sample", fixed_sample)
-    config = config_for("r2d2", updates_per_round=2, learner={"batch_size": 3})
-    state = fresh_state(config, 34, use_target=True)
+    config = config_for("r2d2", updates_per_round=2, learner={"batch_size": 3, **HALFWAY})
+    program = program_for(config)
     episodes = random_episodes(np.random.default_rng(35), LENGTH, 6, terminated=0.1)
-    memory = replay.init(r2d2.packed_item(episodes), 12, 6)
-    new_state, new_memory, metrics = learn_with(r2d2, config)(
-        jax.random.key(0), state, memory, episodes, discount=jnp.float32(0.6)
-    )
+    memory = r2d2.init_memory(episodes, program)
+    state = fresh_state(config, 34, use_target=True, memory=memory, rounds=1)
+    new_state, metrics = learn_with(r2d2, config)(jax.random.key(0), state, episodes)
     exponents = {"priority_exponent": 0.9, "importance_exponent": 0.6}
     assert asked[0] == {"batch_size": 3, **exponents, "axis_name": None}
 
@@ -231,16 +241,15 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
         carry=jnp.zeros_like(episodes.carry),
     )
     part = of_robots(coarse, drawn)
-    now = dataclasses.replace(config.learner, discount=0.6)
     slope = jax.jit(
         jax.value_and_grad(
             lambda params, target: r2d2_loss(
-                params, target, NETWORK, part, jnp.asarray(weights, jnp.float32), now
+                params, target, part, jnp.asarray(weights, jnp.float32), 0.6, program
             ),
             has_aux=True,
         )
     )
-    adam, target = HandMadeAdam(config, state.params), state.target_params
+    adam, target = HandMadeAdam(config, state.params, total_updates=4), state.target_params
     priorities, losses = np.where(np.arange(12) < 6, 1.0, 0.0), []
     for _ in range(2):
         (loss, output), gradient = slope(adam.params, target)
@@ -255,8 +264,8 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
             priorities[place] = mixed
     assert_same_params(new_state.params, adam.params, 0.01)
     assert_same_params(new_state.target_params, target, 0.01)
-    np.testing.assert_allclose(new_memory.priorities, priorities, rtol=2e-3)
-    assert int(new_memory.size) == 6
+    np.testing.assert_allclose(new_state.memory.priorities, priorities, rtol=2e-3)
+    assert int(new_state.memory.size) == 6
     assert int(new_state.num_updates) == 2
     assert set(metrics) == METRICS
     np.testing.assert_allclose(metrics["loss"], np.mean(losses), rtol=1e-4)
@@ -264,18 +273,19 @@ def test_two_r2d2_updates_are_those_made_by_hand(monkeypatch: pytest.MonkeyPatch
 
 def test_r2d2_only_stores_until_there_are_enough_episodes() -> None:
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=7))
-    state = fresh_state(config, 36, use_target=True)
     episodes = random_episodes(np.random.default_rng(37), LENGTH, 6)
-    memory = replay.init(r2d2.packed_item(episodes), 12, 6)
+    memory = r2d2.init_memory(episodes, program_for(config))
+    state = fresh_state(config, 36, use_target=True, memory=memory)
     learn = learn_with(r2d2, config)
-    waiting, memory, metrics = learn(jax.random.key(0), state, memory, episodes)
-    assert int(memory.size) == 6
-    for before, after in zip(jax.tree.leaves(state), jax.tree.leaves(waiting), strict=True):
+    waiting, metrics = learn(jax.random.key(0), state, episodes)
+    assert int(waiting.memory.size) == 6
+    as_before = dataclasses.replace(waiting, memory=memory)
+    for before, after in zip(jax.tree.leaves(state), jax.tree.leaves(as_before), strict=True):
         np.testing.assert_array_equal(before, after)
     assert set(metrics) == METRICS
     assert all(np.isnan(value) for value in metrics.values())
-    learning, memory, metrics = learn(jax.random.key(1), waiting, memory, episodes)
-    assert int(memory.size) == 12
+    learning, metrics = learn(jax.random.key(1), waiting, episodes)
+    assert int(learning.memory.size) == 12
     assert int(learning.num_updates) == 6
     assert all(np.isfinite(value) for value in metrics.values())
 
@@ -293,10 +303,11 @@ def test_r2d2_draws_anew_for_each_update_and_uniformly_if_told(
 
     monkeypatch.setattr(r2d2.replay, "sample", noting_sample)
     config = config_for("r2d2", replay=ReplayConfig(capacity=12, min_episodes=6, prioritized=False))
-    state = fresh_state(config, 38, use_target=True)
     episodes = random_episodes(np.random.default_rng(39), LENGTH, 6)
-    memory = replay.add(replay.init(r2d2.packed_item(episodes), 12, 6), r2d2.pack(episodes))
-    _, after, _ = learn_with(r2d2, config)(jax.random.key(2), state, memory, episodes)
+    memory = r2d2.init_memory(episodes, program_for(config))
+    memory = replay.add(memory, r2d2.pack(episodes))
+    state = fresh_state(config, 38, use_target=True, memory=memory)
+    after = learn_with(r2d2, config)(jax.random.key(2), state, episodes)[0].memory
     uniform = {"priority_exponent": 0.0, "importance_exponent": 0.0, "axis_name": None}
     assert asked
     assert all(settings == uniform for settings in asked)

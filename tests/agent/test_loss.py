@@ -10,42 +10,64 @@ import jax.numpy as jnp
 import learning_oracle as oracle
 import numpy as np
 import pytest
-from small_problems import as_batch, in_float64, random_episodes, random_params, small_network
+from small_problems import (
+    NUM_ACTIONS,
+    as_batch,
+    in_float64,
+    random_episodes,
+    random_params,
+    small_network,
+)
 
 from sqn_jax.agent import Episodes
 from sqn_jax.agent.loss import gate_entropy, pqn_loss, r2d2_loss, skill_distance
-from sqn_jax.config import LearnerConfig
+from sqn_jax.agent.program import Program
+from sqn_jax.config import LearnerConfig, TrainConfig
 
 LENGTH, BATCH = 9, 2
 WEIGHTS = np.array([1.0, 0.3])
 CONFIG = LearnerConfig(burn_in_length=3, n_step=2, discount=0.9, trace_decay=0.7)
 GAPS = dataclasses.replace(CONFIG, advantage_learning=0.5)
 
-r2d2_value = jax.jit(r2d2_loss, static_argnames=("network", "config"))
-pqn_value = jax.jit(pqn_loss, static_argnames=("network", "config"))
+r2d2_value = jax.jit(r2d2_loss, static_argnames="program")
+pqn_value = jax.jit(pqn_loss, static_argnames="program")
 r2d2_slope = jax.jit(
-    jax.grad(r2d2_loss, argnums=(0, 1, 3), has_aux=True, allow_int=True),
-    static_argnames=("network", "config"),
+    jax.grad(r2d2_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True), static_argnames="program"
 )
-pqn_slope = jax.jit(
-    jax.grad(pqn_loss, argnums=0, has_aux=True), static_argnames=("network", "config")
-)
+pqn_slope = jax.jit(jax.grad(pqn_loss, argnums=0, has_aux=True), static_argnames="program")
 
 
 @dataclasses.dataclass
 class Problem:
     """Random networks and episodes, some of whose steps end truly."""
 
+    algo: Any
     network: Any
     params: Any
     target_params: Any
     episodes: Episodes
+
+    def program(self, config: LearnerConfig) -> Program:
+        settings = TrainConfig(algo=self.algo, network=self.network.config, learner=config)
+        return Program(settings, LENGTH, NUM_ACTIONS)
+
+    def r2d2_arguments(self, config: LearnerConfig, discount: Any = None) -> tuple[Any, ...]:
+        """Those of `r2d2_loss`; the discount is the configured one if None."""
+        discount = config.discount if discount is None else discount
+        given = (self.params, self.target_params, self.episodes, jnp.asarray(WEIGHTS, jnp.float32))
+        return (*given, discount, self.program(config))
+
+    def pqn_arguments(self, config: LearnerConfig, discount: Any = None) -> tuple[Any, ...]:
+        """Those of `pqn_loss`."""
+        discount = config.discount if discount is None else discount
+        return self.params, self.episodes, discount, self.program(config)
 
 
 def problem(algo: str, seed: int = 20, **kwargs: Any) -> Problem:
     rng = np.random.default_rng(seed)
     network = small_network(algo, **kwargs)
     return Problem(
+        algo,
         network,
         random_params(network, rng),
         random_params(network, rng),
@@ -54,9 +76,7 @@ def problem(algo: str, seed: int = 20, **kwargs: Any) -> Problem:
 
 
 def r2d2(problem: Problem, config: LearnerConfig) -> tuple[float, Any]:
-    weights = jnp.asarray(WEIGHTS, jnp.float32)
-    given = (problem.params, problem.target_params, problem.network, problem.episodes, weights)
-    loss, output = r2d2_value(*given, config)
+    loss, output = r2d2_value(*problem.r2d2_arguments(config))
     return float(loss), output
 
 
@@ -140,7 +160,7 @@ def test_the_r2d2_loss_of_the_other_networks_equals_the_slow_one(algo: str) -> N
 def test_the_pqn_loss_equals_the_slow_one(changes: dict[str, Any]) -> None:
     given = problem("sqn", layer_norm=True)
     config = dataclasses.replace(CONFIG, **changes)
-    loss, output = pqn_value(given.params, given.network, given.episodes, config)
+    loss, output = pqn_value(*given.pqn_arguments(config))
     expected_loss, expected_errors = pqn_by_hand(given, config, "sqn")
     # Burn-in, n and the importance weights are no matter of this method.
     assert output.td_errors.shape == (LENGTH, BATCH)
@@ -153,12 +173,10 @@ def test_a_discount_of_the_moment_takes_the_place_of_the_configured_one(method: 
     given, now = problem("sqn"), jnp.float32(0.6)
     config = dataclasses.replace(CONFIG, discount=0.6)
     if method == "r2d2":
-        weights = jnp.asarray(WEIGHTS, jnp.float32)
-        call = (given.params, given.target_params, given.network, given.episodes, weights)
-        loss, _ = r2d2_value(*call, CONFIG, now)
+        loss, _ = r2d2_value(*given.r2d2_arguments(CONFIG, now))
         expected, _ = r2d2_by_hand(given, config, "sqn")
     else:
-        loss, _ = pqn_value(given.params, given.network, given.episodes, CONFIG, now)
+        loss, _ = pqn_value(*given.pqn_arguments(CONFIG, now))
         expected, _ = pqn_by_hand(given, config, "sqn")
     np.testing.assert_allclose(loss, expected, rtol=5e-5)
 
@@ -180,13 +198,11 @@ def test_only_predictions_after_burn_in_carry_a_gradient(
     given = problem("sqn", seed=21)
     frozen = in_float64(given.params)
     if method == "r2d2":
-        weights = jnp.asarray(WEIGHTS, jnp.float32)
-        call = (given.params, given.target_params, given.network, given.episodes, weights)
-        (gradient, target_gradient, _), _ = r2d2_slope(*call, config)
+        (gradient, target_gradient, _), _ = r2d2_slope(*given.r2d2_arguments(config))
         assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(target_gradient))
         by_hand = r2d2_by_hand
     else:
-        gradient, _ = pqn_slope(given.params, given.network, given.episodes, config)
+        gradient, _ = pqn_slope(*given.pqn_arguments(config))
         by_hand = pqn_by_hand
 
     rng = np.random.default_rng(22)
@@ -208,12 +224,10 @@ def test_only_predictions_after_burn_in_carry_a_gradient(
 
 def test_the_loss_hangs_on_what_was_seen_in_burn_in_but_sends_no_gradient_there() -> None:
     given = problem("sqn")
-    weights = jnp.asarray(WEIGHTS, jnp.float32)
     burn_in = CONFIG.burn_in_length
 
     def slope(config: LearnerConfig) -> np.ndarray:
-        call = (given.params, given.target_params, given.network, given.episodes, weights)
-        (_, _, gradient), _ = r2d2_slope(*call, config)
+        (_, _, gradient), _ = r2d2_slope(*given.r2d2_arguments(config))
         return np.abs(np.asarray(gradient.obs.ranges)).max(axis=(1, 2))
 
     assert (slope(CONFIG)[:burn_in] == 0).all()
@@ -232,10 +246,11 @@ def test_the_recurrent_state_at_the_beginning_counts(method: str) -> None:
     moved = given.episodes.replace(carry=given.episodes.carry + 0.5)
     losses = []
     for episodes in (given.episodes, moved):
+        each = dataclasses.replace(given, episodes=episodes)
         if method == "r2d2":
-            losses.append(r2d2(dataclasses.replace(given, episodes=episodes), CONFIG)[0])
+            losses.append(r2d2(each, CONFIG)[0])
         else:
-            losses.append(float(pqn_value(given.params, given.network, episodes, CONFIG)[0]))
+            losses.append(float(pqn_value(*each.pqn_arguments(CONFIG))[0]))
     assert abs(losses[0] - losses[1]) > 1e-4
 
 
@@ -256,10 +271,11 @@ def test_the_last_observation_counts_at_a_time_limit_and_not_after_a_true_end(me
     given = problem("sqn", layer_norm=method == "pqn")
 
     def last_errors(episodes: Episodes) -> np.ndarray:
+        each = dataclasses.replace(given, episodes=episodes)
         if method == "r2d2":
-            output = r2d2(dataclasses.replace(given, episodes=episodes), CONFIG)[1]
+            output = r2d2(each, CONFIG)[1]
         else:
-            output = pqn_value(given.params, given.network, episodes, CONFIG)[1]
+            output = pqn_value(*each.pqn_arguments(CONFIG))[1]
         return np.asarray(output.td_errors)
 
     for ended in (False, True):

@@ -6,8 +6,6 @@ lamp showed earns 1, the other -1. A clock tells when, nothing else tells what.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +13,9 @@ import pytest
 from jax import Array
 from small_problems import Seen, random_params
 
-from sqn_jax.agent import Episodes, initial_carry, make_network, pqn, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, make_optimizer
+from sqn_jax.agent import Episodes, initial_carry, pqn, r2d2
+from sqn_jax.agent.learner import LearnerState
+from sqn_jax.agent.program import Program
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 
 LENGTH, NUM_ROBOTS, LAMP_STEP, ASKED_STEP = 9, 32, 2, 8
@@ -49,8 +48,9 @@ def random_round(key: Array) -> Episodes:
     )
 
 
-def config_for(method: str) -> TrainConfig:
+def config_for(algo: str, method: str) -> TrainConfig:
     return TrainConfig(
+        algo=algo,
         method=method,
         num_envs=NUM_ROBOTS,
         updates_per_round=2,
@@ -70,33 +70,33 @@ def config_for(method: str) -> TrainConfig:
 
 def answers_after_training(algo: str, method: str, seed: int = 0) -> list[int]:
     """Greedy answers to the lamps 0 and 1 after learning."""
-    config = config_for(method)
-    network = make_network(algo, config.network, 2)
-    optimizer = make_optimizer(config.learner, 2 * ROUNDS)
+    program = Program(config_for(algo, method), LENGTH, num_actions=2)
+    network = program.network
     example = random_round(jax.random.key(seed))
     params = random_params(network, np.random.default_rng(seed), example.obs)
-    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0), jnp.int32(0))
-    block = example.actions.shape[1]
-    memory = replay.init(r2d2.packed_item(example), config.replay.capacity, block)
+    state = LearnerState(
+        params=params,
+        target_params=params,
+        opt_state=program.optimizer.init(params),
+        memory=r2d2.init_memory(example, program) if method == "r2d2" else None,
+        round=jnp.int32(0),
+        num_updates=jnp.int32(0),
+        num_skipped=jnp.int32(0),
+    )
     learn = r2d2.learn if method == "r2d2" else pqn.learn
 
-    def one_round(carry: Any, key: Array) -> tuple[Any, None]:
-        state, memory = carry
+    def one_round(state: LearnerState, key: Array) -> tuple[LearnerState, None]:
         round_key, learn_key = jax.random.split(key)
-        episodes = random_round(round_key)
-        state, memory, _ = learn(
-            learn_key, state, memory, episodes, network=network, optimizer=optimizer, config=config
-        )
-        return (state, memory), None
+        return learn(learn_key, state, random_round(round_key), program)[0], None
 
     @jax.jit
-    def train_and_ask(carry: Any, key: Array) -> Array:
-        (state, _), _ = jax.lax.scan(one_round, carry, jax.random.split(key, ROUNDS))
+    def train_and_ask(state: LearnerState, key: Array) -> Array:
+        state, _ = jax.lax.scan(one_round, state, jax.random.split(key, ROUNDS))
         obs = observations(jnp.arange(2))
-        _, output = network.apply(state.params, obs, initial_carry(config.network, 2))
+        _, output = network.apply(state.params, obs, initial_carry(program.config.network, 2))
         return jnp.argmax(output.q_values[ASKED_STEP], axis=-1)
 
-    return np.asarray(train_and_ask((state, memory), jax.random.key(seed))).tolist()
+    return np.asarray(train_and_ask(state, jax.random.key(seed))).tolist()
 
 
 @pytest.mark.parametrize(("algo", "method"), [("sqn", "r2d2"), ("r2d2", "pqn")])

@@ -10,10 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_problems import HIDDEN, of_robots, random_episodes, random_params, small_network
+from small_problems import (
+    HIDDEN,
+    NUM_ACTIONS,
+    of_robots,
+    random_episodes,
+    random_params,
+    small_network,
+)
 
 from sqn_jax.agent import pqn, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, make_optimizer
+from sqn_jax.agent.learner import LearnerState
+from sqn_jax.agent.program import Program
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 
 NETWORK = small_network("r2d2")
@@ -22,6 +30,7 @@ LENGTH = 5
 
 def config_for(num_envs: int, method: Any = "pqn") -> TrainConfig:
     return TrainConfig(
+        algo="r2d2",
         method=method,
         total_episodes=60,
         num_envs=num_envs,
@@ -34,19 +43,22 @@ def config_for(num_envs: int, method: Any = "pqn") -> TrainConfig:
     )
 
 
-def learnt(method: Any, config: TrainConfig, episodes: Any, memory: Any = None) -> Any:
-    optimizer = make_optimizer(config.learner, 10)
+def learnt(method: Any, config: TrainConfig, episodes: Any) -> LearnerState:
+    program = Program(config, LENGTH, NUM_ACTIONS)
     rng = np.random.default_rng(5)
     params = random_params(NETWORK, rng)
     state = LearnerState(
         params=params,
         target_params=random_params(NETWORK, rng),
-        opt_state=optimizer.init(params),
+        opt_state=program.optimizer.init(params),
+        memory=r2d2.init_memory(episodes, program) if method is r2d2 else None,
+        round=jnp.int32(0),
         num_updates=jnp.int32(0),
         num_skipped=jnp.int32(0),
     )
-    learn = jax.jit(partial(method.learn, network=NETWORK, optimizer=optimizer, config=config))
-    return learn(jax.random.key(0), state, memory, episodes)
+    learn = jax.jit(partial(method.learn, program=program))
+    state, _ = learn(jax.random.key(0), state, episodes)
+    return state
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -59,9 +71,9 @@ def test_a_minibatch_with_a_bad_reward_is_as_if_it_had_not_been_there(bad: float
     episodes = random_episodes(np.random.default_rng(6), LENGTH, 6)
     # Robots 0 and 3, 1 and 4, 2 and 5 share a minibatch: the second is the bad one.
     rewards = episodes.rewards.at[2, 4].set(bad)
-    state, _, _ = learnt(pqn, config_for(6), dataclasses.replace(episodes, rewards=rewards))
+    state = learnt(pqn, config_for(6), dataclasses.replace(episodes, rewards=rewards))
     without = of_robots(episodes, np.array([0, 2, 3, 5]))
-    expected, _, _ = learnt(pqn, config_for(4), without)
+    expected = learnt(pqn, config_for(4), without)
     assert_same(state.params, expected.params)
     assert_same(state.opt_state, expected.opt_state)
     assert int(state.num_skipped) == 1
@@ -76,9 +88,10 @@ def test_a_bad_episode_in_the_replay_spoils_neither_parameters_nor_priorities() 
     episodes = random_episodes(np.random.default_rng(7), LENGTH, 6)
     rewards = episodes.rewards.at[2, 4].set(np.nan)
     bad = dataclasses.replace(episodes, rewards=rewards)
-    memory = replay.init(r2d2.packed_item(bad), 12, 6)
-    state, memory, _ = learnt(r2d2, config, bad, memory)
+    state = learnt(r2d2, config, bad)
+    memory = state.memory
     assert 0 < int(state.num_skipped) <= int(state.num_updates) == 4
+    state = dataclasses.replace(state, memory=None)
     for leaf in jax.tree.leaves((state, memory.priorities, memory.max_priority)):
         assert np.isfinite(leaf).all()
 

@@ -15,13 +15,11 @@ import numpy as np
 import pytest
 from compiling import compiling_quickly
 
-from experiments import (
-    bench_learner,
-    operations,
-)
+from experiments import operations
 from sqn_jax.agent import Episodes, gru, linear, make_network, networks, r2d2, replay
-from sqn_jax.agent.learner import LearnerState, make_optimizer
+from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.loss import r2d2_loss
+from sqn_jax.agent.program import Program
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.env import Observation
 
@@ -55,6 +53,23 @@ def random_params(rng: np.random.Generator, algo: str, episodes: Episodes) -> An
     )
 
 
+def program_for(learner: LearnerConfig, algo: Any = "sqn", **changes: Any) -> Program:
+    config = TrainConfig(algo=algo, network=SIZES, learner=learner, **changes)
+    return Program(config, LENGTH, ACTIONS)
+
+
+def fresh_state(params: Any, target_params: Any, program: Program) -> LearnerState:
+    return LearnerState(
+        params=params,
+        target_params=target_params,
+        opt_state=program.optimizer.init(params),
+        memory=None,
+        round=jnp.int32(0),
+        num_updates=jnp.int32(0),
+        num_skipped=jnp.int32(0),
+    )
+
+
 @pytest.fixture
 def torch_sqn() -> Any:
     pytest.importorskip("torch")
@@ -83,9 +98,8 @@ def test_pytorch_finds_the_same_loss_errors_and_gradients(
     rng = np.random.default_rng(3)
     episodes, weights = random_batch(rng)
     params, target_params = (random_params(rng, "sqn", episodes) for _ in range(2))
-    network = make_network("sqn", SIZES, ACTIONS)
     (loss, output), gradient = jax.value_and_grad(r2d2_loss, has_aux=True)(
-        params, target_params, network, episodes, weights, config
+        params, target_params, episodes, weights, config.discount, program_for(config)
     )
 
     learner = torch_learner(torch_sqn, params, target_params, config)
@@ -107,22 +121,12 @@ def test_pytorch_goes_the_same_way_in_several_updates(torch_sqn: Any) -> None:
     rng = np.random.default_rng(4)
     batches = [random_batch(rng) for _ in range(3)]
     params, target_params = (random_params(rng, "sqn", batches[0][0]) for _ in range(2))
-    optimizer = make_optimizer(LEARNER, 3)
-    state = LearnerState(
-        params=params,
-        target_params=target_params,
-        opt_state=optimizer.init(params),
-        num_updates=jnp.int32(0),
-        num_skipped=jnp.int32(0),
-    )
-    config = TrainConfig(learner=LEARNER, replay=ReplayConfig(max_priority_weight=PRIORITY_WEIGHT))
-    network = make_network("sqn", SIZES, ACTIONS)
+    program = program_for(LEARNER, replay=ReplayConfig(max_priority_weight=PRIORITY_WEIGHT))
+    state = fresh_state(params, target_params, program)
     learner = torch_learner(torch_sqn, params, target_params, LEARNER)
     theirs = learner.updates([torch_sqn.to_torch(*batch) for batch in batches])
     for batch, their_priorities in zip(batches, theirs, strict=True):
-        state, (priorities, metrics) = bench_learner.update_from_drawn(
-            state, batch, network=network, optimizer=optimizer, config=config, axis_name=None
-        )
+        state, priorities, metrics = r2d2.learn_from(state, *batch, program)
         assert metrics["gradient_norm"] > LEARNER.max_grad_norm, "nothing is clipped"
         np.testing.assert_allclose(their_priorities.numpy(), priorities, rtol=1e-4)
     for found, expected, start in (
@@ -153,30 +157,23 @@ def test_an_update_from_drawn_episodes_is_that_of_the_learner() -> None:
         lambda x: x[:, :1] if x.ndim > 1 else x, random_batch(rng)[0].replace(carry=None)
     )
     first = first.replace(carry=jnp.zeros((1, SIZES.hidden_size)))
-    config = TrainConfig(
-        network=SIZES,
+    program = program_for(
+        dataclasses.replace(LEARNER, batch_size=2),
         num_envs=1,
-        learner=dataclasses.replace(LEARNER, batch_size=2),
         replay=ReplayConfig(capacity=1, min_episodes=1),
     )
     params = random_params(rng, "sqn", first)
-    optimizer = make_optimizer(config.learner, 1)
-    state = LearnerState(params, params, optimizer.init(params), jnp.int32(0), jnp.int32(0))
-    given = {
-        "network": make_network("sqn", SIZES, ACTIONS),
-        "optimizer": optimizer,
-        "config": config,
-        "axis_name": None,
-    }
-    memory = replay.add(replay.init(r2d2.packed_item(first), 1, 1), r2d2.pack(first))
+    state = fresh_state(params, params, program)
+    memory = replay.add(r2d2.init_memory(first, program), r2d2.pack(first))
     twice = jax.tree.map(lambda x: jnp.repeat(x[0], 2, axis=0), memory.storage)
     batch = (r2d2.unpack(twice, SIZES.hidden_size), jnp.ones(2))
     with compiling_quickly():
-        whole = jax.jit(partial(r2d2._update, discount=None, **given))
-        (expected, memory), _ = whole((state, memory), jax.random.key(0))
-        update = jax.jit(partial(bench_learner.update_from_drawn, **given))
-        found, (priorities, _) = update(state, batch)
-    np.testing.assert_allclose(priorities, jnp.repeat(memory.priorities, 2), rtol=1e-6)
+        whole = jax.jit(partial(r2d2.update, program=program))
+        expected, _ = whole(jax.random.key(0), dataclasses.replace(state, memory=memory))
+        update = jax.jit(partial(r2d2.learn_from, program=program))
+        found, priorities, _ = update(state, *batch)
+    np.testing.assert_allclose(priorities, jnp.repeat(expected.memory.priorities, 2), rtol=1e-6)
+    expected = dataclasses.replace(expected, memory=None)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), found, expected)
 
 
@@ -258,10 +255,10 @@ def test_operations_of_an_update_are_those_of_the_traced_program(
     rng = np.random.default_rng(6)
     episodes, weights = random_batch(rng)
     params = random_params(rng, algo, episodes)
-    network = make_network(algo, SIZES, ACTIONS)
+    program = program_for(config, algo)
     traced = jax.make_jaxpr(
         lambda params, target: jax.value_and_grad(r2d2_loss, has_aux=True)(
-            params, target, network, episodes, weights, config
+            params, target, episodes, weights, config.discount, program
         )
     )(params, params)
     assert operations_in(traced.jaxpr) == operations.update_operations(

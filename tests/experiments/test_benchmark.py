@@ -73,7 +73,7 @@ def test_updates_and_robots_divided_between_devices_are_those_of_one() -> None:
         one, two = (bench_learner.drawn_program(problem, mesh)(0) for mesh in devices.one_and_all())
     assert one[0].shape == (3, 4)
     np.testing.assert_allclose(two[0], one[0], rtol=1e-3)
-    mesh = devices.first(2)
+    mesh = devices.first_devices(2)
 
     def drive(key: jax.Array, world: jax.Array, num_envs: int) -> jax.Array:
         return jax.random.uniform(key, (7, num_envs)) + world

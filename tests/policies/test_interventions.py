@@ -15,7 +15,8 @@ from sqn_jax.agent.networks import QOutput
 from sqn_jax.config import NetworkConfig, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
 from sqn_jax.policies.interventions import fix_skill_weights, single_head, swap_skills
-from sqn_jax.policies.run_policies import Policy, params_shapes
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.state import params_shapes
 
 CONFIG = TrainConfig(network=NetworkConfig(hidden_size=8, num_skills=3))
 NETWORK = make_network("sqn", CONFIG.network, NUM_ACTIONS)

@@ -13,12 +13,13 @@ from compiling import compiling_quickly
 from PIL import Image
 from rooms import random_params, small_room, write_empty_room
 
+from sqn_jax.agent import make_network
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.env import NUM_ACTIONS
 from sqn_jax.policies import pretrained
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.render import agent_names, default_folder
-from sqn_jax.training.loop import network_of
 
 STEPS = 12
 BEAMS = 11  # Few compile sooner.
@@ -31,7 +32,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("weights")
     room = small_room(STEPS, num_beams=BEAMS)
     for seed, name in enumerate(("one", "two")):
-        params = random_params(network_of(TINY), room, seed)
+        params = random_params(make_network(TINY.algo, TINY.network, NUM_ACTIONS), room, seed)
         pretrained.write_policy(folder, Policy(name, TINY, (params,)), {})
     return folder
 

@@ -35,7 +35,7 @@ from sqn_jax.report.pictures import Picture, Pictures, curves
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.storage.run_folder import RunFolder
-from sqn_jax.training.loop import start_run
+from sqn_jax.training.loop import make_program, start_run
 from sqn_jax.training.rollout import EpisodeSummary
 
 EVIL = '<script>alert("x")</script><img src=http://evil.example/a.png>&amp;$\\frac$'
@@ -337,7 +337,8 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
     )
     folder = RunFolder.create(path, config)
     with compiling_quickly():
-        runner = start_run(make_env(load_map(room_file), config.env), config)
+        world = make_env(load_map(room_file), config.env)
+        runner = start_run(world, make_program(world, config))
         with Checkpoints(path, Origin(config)) as checkpoints:
             checkpoints.save(1, runner)
         for chunk in (1, 2):

@@ -21,12 +21,11 @@ from sqn_jax.config import NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import EnvParams
 from sqn_jax.maps import load_map
-from sqn_jax.policies.run_policies import params_shapes
 from sqn_jax.storage import manifest
 from sqn_jax.storage.checkpoint import Checkpoints, NotSaved
 from sqn_jax.storage.manifest import Mismatch, Origin
 from sqn_jax.training import loop
-from sqn_jax.training.loop import RunnerState
+from sqn_jax.training.state import RunnerState, params_shapes
 
 LENGTH = 6
 
@@ -53,7 +52,7 @@ def world() -> EnvParams:
 def states(world: EnvParams) -> list[RunnerState]:
     """Three states of one run in which every number differs from one to the next."""
     with compiling_quickly():
-        start = loop.start_run(world, config_for())
+        start = loop.start_run(world, loop.make_program(world, config_for()))
 
     def moved(by: int) -> RunnerState:
         def shift(x: Any) -> Any:
@@ -68,7 +67,7 @@ def states(world: EnvParams) -> list[RunnerState]:
 
 @pytest.fixture(scope="module")
 def shapes(world: EnvParams) -> RunnerState:
-    return loop.runner_shapes(world, config_for())
+    return loop.runner_shapes(world, loop.make_program(world, config_for()))
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +89,10 @@ def folder(saved: Path, tmp_path: Path) -> Path:
     """A copy to do damage to."""
     shutil.copytree(saved, tmp_path / "run")
     return tmp_path / "run"
+
+
+def without_replay(runner: RunnerState) -> RunnerState:
+    return dataclasses.replace(runner, learner=dataclasses.replace(runner.learner, memory=None))
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -291,7 +294,7 @@ def test_another_network_is_told_in_a_table_and_nothing_is_moved(
 ) -> None:
     wide = dataclasses.replace(config_for(), network=NetworkConfig(hidden_size=16), seed=3)
     with opened(folder, wide) as checkpoints, pytest.raises(Mismatch) as told:
-        checkpoints.restore(loop.runner_shapes(world, wide))
+        checkpoints.restore(loop.runner_shapes(world, loop.make_program(world, wide)))
     lines = [line.split() for line in told.value.table.splitlines()]
     assert ["network.hidden_size", "8", "16"] in lines
     assert ["network.layer_norm", "True", "False"] in lines
@@ -304,7 +307,8 @@ def test_another_network_is_told_in_a_table_and_nothing_is_moved(
 
 def test_another_form_of_the_state_is_told_array_by_array(folder: Path, world: EnvParams) -> None:
     """As when another version of the program wrote it."""
-    shapes = loop.runner_shapes(world, dataclasses.replace(config_for(), num_seeds=2))
+    two_seeds = dataclasses.replace(config_for(), num_seeds=2)
+    shapes = loop.runner_shapes(world, loop.make_program(world, two_seeds))
     with opened(folder) as checkpoints, pytest.raises(Mismatch) as told:
         checkpoints.restore(shapes)
     assert "rest/round" in told.value.table
@@ -407,13 +411,13 @@ def test_a_light_checkpoint_leaves_out_the_replay_and_says_so(
         checkpoints.save(1, states[1], light=True)
         found, told = checkpoints.restore(shapes)
     assert not told.is_exact
-    assert found.memory is None
-    assert_same(found.learner, states[1].learner)
+    assert found.learner.memory is None
+    assert_same(found, without_replay(states[1]))
     assert not (tmp_path / "checkpoints" / "1" / "memory").exists()
-    pqn = dataclasses.replace(states[2], memory=None)
+    pqn = without_replay(states[2])
     with opened(tmp_path) as checkpoints:  # Without a replay there is nothing to leave out.
         checkpoints.save(2, pqn, light=True)
-        found, told = checkpoints.restore(dataclasses.replace(shapes, memory=None))
+        found, told = checkpoints.restore(without_replay(shapes))
     assert told.is_exact
     assert_same(found, pqn)
 

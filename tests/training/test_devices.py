@@ -16,13 +16,15 @@ from compiling import compiling_quickly
 from jax.sharding import Mesh, PartitionSpec
 from rooms import small_room
 
-from sqn_jax.agent import shares
+from sqn_jax.agent import shards
+from sqn_jax.agent.learner import policy_params
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
-from sqn_jax.policies.run_policies import params_shapes
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.training import devices, loop
+from sqn_jax.training.loop import make_program
+from sqn_jax.training.state import params_shapes
 
 LENGTH = 12
 
@@ -67,18 +69,18 @@ def spread(mesh: Mesh, function: Any, *specs: PartitionSpec, out: Any) -> Any:
 WHOLE, ROWS, COLUMNS = PartitionSpec(), PartitionSpec("devices"), PartitionSpec(None, "devices")
 
 
-def test_own_shares_laid_together_are_the_whole(mesh: Mesh) -> None:
+def test_own_shards_laid_together_are_the_whole(mesh: Mesh) -> None:
     whole = jnp.arange(24.0).reshape(6, 4)
     for axis, divided in ((0, ROWS), (1, COLUMNS)):
-        cut = partial(shares.own_share, axis_name="devices", axis=axis)
+        cut = partial(shards.own_shard, axis_name="devices", axis=axis)
         np.testing.assert_array_equal(spread(mesh, cut, WHOLE, out=divided)(whole), whole)
-    gather = partial(shares.all_shares, axis_name="devices")
+    gather = partial(shards.all_shards, axis_name="devices")
     np.testing.assert_array_equal(spread(mesh, gather, ROWS, out=WHOLE)(whole), whole)
 
 
 def test_the_mean_over_devices_is_that_of_their_trees(mesh: Mesh) -> None:
     tree = {"a": jnp.arange(8.0).reshape(4, 2), "b": jnp.arange(2.0)}
-    average = spread(mesh, partial(shares.mean, axis_name="devices"), ROWS, out=WHOLE)
+    average = spread(mesh, partial(shards.mean, axis_name="devices"), ROWS, out=WHOLE)
     found = average(tree)
     np.testing.assert_array_equal(found["a"], [[2, 3], [4, 5]])
     np.testing.assert_array_equal(found["b"], [0.5])
@@ -90,11 +92,11 @@ def test_items_are_fetched_from_whichever_device_holds_them(mesh: Mesh, dtype: A
     stored = rng.integers(0, 250, (3, 4, 5)).astype(dtype)
     rows, columns = rng.integers(0, 3, 8), rng.integers(0, 4, 8)
     assert {tuple(columns[:4] // 2), tuple(columns[4:] // 2)} != {(0,) * 4, (1,) * 4}
-    fetch = spread(mesh, partial(shares.take, axis_name="devices"), COLUMNS, WHOLE, WHOLE, out=ROWS)
+    fetch = spread(mesh, partial(shards.take, axis_name="devices"), COLUMNS, WHOLE, WHOLE, out=ROWS)
     found = fetch(jnp.asarray(stored), jnp.asarray(rows), jnp.asarray(columns))
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, stored[rows, columns])
-    alone = shares.take(jnp.asarray(stored), jnp.asarray(rows), jnp.asarray(columns), None)
+    alone = shards.take(jnp.asarray(stored), jnp.asarray(rows), jnp.asarray(columns), None)
     np.testing.assert_array_equal(alone, stored[rows, columns])
 
 
@@ -108,8 +110,9 @@ def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_se
     world = small_room(LENGTH, velocity_noise=0.2, range_noise=0.2)
     found = []
     for chosen in (None, mesh):
-        runner = loop.start_run(world, config, chosen)
-        *_, (runner, last) = loop.run(runner, world, config, mesh=chosen)
+        program = make_program(world, config, chosen)
+        runner = loop.start_run(world, program)
+        *_, (runner, last) = loop.run(runner, world, program)
         found.append((runner, last.metrics))
     (one, told_by_one), (two, told_by_two) = found
     assert len(jax.tree.leaves(two.learner.params)[0].sharding.device_set) == 2
@@ -123,7 +126,9 @@ def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_se
         np.testing.assert_allclose(theirs, ours, atol=1e-4)
     if method == "r2d2":
         jax.tree.map(
-            lambda x, y: np.testing.assert_allclose(y, x, atol=1e-3), one.memory, two.memory
+            lambda x, y: np.testing.assert_allclose(y, x, atol=1e-3),
+            one.learner.memory,
+            two.learner.memory,
         )
 
 
@@ -133,18 +138,19 @@ def test_a_run_saved_on_two_devices_goes_on_and_is_evaluated_on_one(
 ) -> None:
     config = config_for(method)
     world = small_room(LENGTH)
-    runner = loop.start_run(world, config, mesh)
+    one, both = (make_program(world, config, chosen) for chosen in (None, mesh))
+    runner = loop.start_run(world, both)
     with Checkpoints(tmp_path, Origin(config)) as checkpoints:
         checkpoints.save(1, runner)
-        alone, _ = checkpoints.restore(loop.runner_shapes(world, config, None))
-        again, _ = checkpoints.restore(loop.runner_shapes(world, config, mesh))
-        params = checkpoints.restore_policy(params_shapes(config), averaged=loop.averages(config))
+        alone, _ = checkpoints.restore(loop.runner_shapes(world, one))
+        again, _ = checkpoints.restore(loop.runner_shapes(world, both))
+        params = checkpoints.restore_policy(params_shapes(config), averaged=config.averages_params)
     for found, where in ((alone, 1), (again, 2)):
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(runner), strict=True):
             if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
                 np.testing.assert_array_equal(x, y)
         assert len(jax.tree.leaves(found.learner.params)[0].sharding.device_set) == where
-    expected = loop.policy_params(runner.learner, config)
+    expected = policy_params(runner.learner, config)
     jax.tree.map(np.testing.assert_array_equal, params, expected)
     for leaf in jax.tree.leaves(params):
         assert leaf.sharding.device_set == {jax.devices()[0]}

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from compiling import compiling_quickly
 
+from sqn_jax.agent.program import Program
 from sqn_jax.config import ReplayConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.training import loop
-from sqn_jax.training.loop import RunnerState
+from sqn_jax.training.loop import make_program
+from sqn_jax.training.state import RunnerState, memory_bytes
 
 METRICS = {
     *("mean_reward", "success", "time_steps", "collisions", "covered_area", "skill_usage"),
@@ -88,10 +90,10 @@ def assert_same_bits(one: Any, other: Any) -> None:
 
 
 def all_chunks(runner: RunnerState, run: Trained) -> tuple[RunnerState, list[Any]]:
-    """Train to the end with a run's program; the final state and the metrics of all rounds."""
+    """Train to the end with what a run compiled; the final state and the metrics of all rounds."""
     metrics = []
     for _ in range(run.config.num_chunks):
-        runner, chunk = run.program(runner, run.world)
+        runner, chunk = run.compiled(runner, run.world)
         metrics.append(jax.device_get(chunk))
     return runner, metrics
 
@@ -100,17 +102,22 @@ def all_chunks(runner: RunnerState, run: Trained) -> tuple[RunnerState, list[Any
 class Trained:
     """A run done once for several tests."""
 
-    config: TrainConfig
+    program: Program
     world: EnvParams
-    program: loop.ChunkProgram
+    compiled: loop.CompiledChunk
     final: RunnerState
     metrics: list[Any]
     traces: list[int]
     keys: list[tuple[int, ...]]
 
+    @property
+    def config(self) -> TrainConfig:
+        return self.program.config
+
 
 def trained(config: TrainConfig, world: EnvParams) -> Trained:
-    """Train once, and note how often the program had been traced after each chunk."""
+    """Train once, and note how often a round had been traced after each chunk."""
+    program = make_program(world, config)
     count = 0
     body = loop.train_round
 
@@ -121,17 +128,18 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "train_round", counted)
-        program, _ = loop.compile_chunk(world, config)
-        runner, metrics, traces = loop.start_run(world, config), [], []
+        compiled, _ = loop.compile_chunk(world, program)
+        runner, metrics, traces = loop.start_run(world, program), [], []
         keys = [tuple(numbers(runner.key)[0].tolist())]
         for _ in range(config.num_chunks):
-            runner, chunk = program(runner, world)
+            runner, chunk = compiled(runner, world)
             metrics.append(jax.device_get(chunk))
             traces.append(count)
             keys.append(tuple(numbers(runner.key)[0].tolist()))
-        for _ in loop.run(loop.start_run(world, config), world, config):
+        again = make_program(world, config)
+        for _ in loop.run(loop.start_run(world, again), world, again):
             traces.append(count)
-    return Trained(config, world, program, runner, metrics, traces, keys)
+    return Trained(program, world, compiled, runner, metrics, traces, keys)
 
 
 @pytest.fixture(scope="module")
@@ -157,12 +165,12 @@ def other_seed(smoke: Trained) -> tuple[RunnerState, list[Any]]:
     """The smoke preset from the next seed, in the same program."""
     config = dataclasses.replace(smoke.config, seed=smoke.config.seed + 1)
     with compiling_quickly():
-        runner = loop.start_run(smoke.world, config)
+        runner = loop.start_run(smoke.world, make_program(smoke.world, config))
     return all_chunks(runner, smoke)
 
 
 def test_the_program_is_traced_once(either: Trained) -> None:
-    """Over all chunks, and again when `run` drives it."""
+    """Over all chunks, and again by `run` for an equal program."""
     assert len(either.traces) == 2 * either.config.num_chunks > 2
     assert either.traces[0] > 0
     assert set(either.traces) == {either.traces[0]}
@@ -175,14 +183,14 @@ def test_a_state_from_a_checkpoint_gets_the_program_of_a_new_one(smoke: Trained)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jax.stages.Lowered, "compile", lambda lowered, **_: lowered.as_text())
         new, resumed = (
-            loop.compile_chunk(world, smoke.config)[0] for world in (smoke.world, bound)
+            loop.compile_chunk(world, smoke.program)[0] for world in (smoke.world, bound)
         )
     assert "while" in str(new)
     assert new == resumed
 
 
 def test_the_same_seed_gives_the_same_numbers_bit_for_bit(either: Trained) -> None:
-    runner = loop.start_run(either.world, either.config)
+    runner = loop.start_run(either.world, either.program)
     final, metrics = all_chunks(runner, either)
     assert_same_bits(final, either.final)
     assert_same_bits(metrics, either.metrics)
@@ -218,21 +226,20 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
     one robot among 16), so that what is seen and learned in one chunk, of 1,920 steps and 8
     updates, agrees to 2 %. Between the two seeds there lies far more.
     """
-    config = dataclasses.replace(smoke.config, num_seeds=2)
+    program = make_program(smoke.world, dataclasses.replace(smoke.config, num_seeds=2))
     with compiling_quickly():
-        runners = loop.start_run(smoke.world, config)
+        runners = loop.start_run(smoke.world, program)
     for index in range(2):
-        alone = loop.start_run(
-            smoke.world, dataclasses.replace(smoke.config, seed=smoke.config.seed + index)
-        )
+        config = dataclasses.replace(smoke.config, seed=smoke.config.seed + index)
+        alone = loop.start_run(smoke.world, make_program(smoke.world, config))
         np.testing.assert_array_equal(numbers(runners.key)[0][index], numbers(alone.key)[0])
         for one, other in zip(
             numbers(runners.learner.params), numbers(alone.learner.params), strict=True
         ):
             np.testing.assert_allclose(one[index], other, atol=1e-5)
     with compiling_quickly():
-        program, _ = loop.compile_chunk(smoke.world, config)
-        _, metrics = program(runners, smoke.world)
+        compiled, _ = loop.compile_chunk(smoke.world, program)
+        _, metrics = compiled(runners, smoke.world)
     for index, alone in enumerate((smoke.metrics[0], other_seed[1][0])):
         for name in METRICS:
             np.testing.assert_allclose(
@@ -241,32 +248,32 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
 
 
 def test_the_state_given_to_a_chunk_is_donated(either: Trained) -> None:
-    runner = loop.start_run(either.world, either.config)
-    new_runner, _ = either.program(runner, either.world)
+    runner = loop.start_run(either.world, either.program)
+    new_runner, _ = either.compiled(runner, either.world)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(either.world))
 
 
 def test_a_run_resumed_mid_way_ends_as_the_uninterrupted_one(either: Trained) -> None:
-    config, world = either.config, either.world
-    start = loop.start_run(world, config)
-    runner, report = next(loop.run(start, world, config))
+    config, world, program = either.config, either.world, either.program
+    start = loop.start_run(world, program)
+    runner, report = next(loop.run(start, world, program))
     assert report.chunk == 1
     # The next chunk would take the state itself.
     restored = jax.tree.map(jnp.copy, runner)
     reports = []
-    for state, report in loop.run(restored, world, config):
+    for state, report in loop.run(restored, world, program):
         reports.append(report)
         final = state
     assert [report.chunk for report in reports] == list(range(2, config.num_chunks + 1))
     assert_same_bits(final, either.final)
-    assert list(loop.run(final, world, config)) == []
+    assert list(loop.run(final, world, program)) == []
 
 
 def test_reports_say_what_the_rounds_did(either: Trained) -> None:
-    config, world = either.config, either.world
-    reports = [r for _, r in loop.run(loop.start_run(world, config), world, config)]
+    config, world, program = either.config, either.world, either.program
+    reports = [r for _, r in loop.run(loop.start_run(world, program), world, program)]
     assert [report.chunk for report in reports] == list(range(1, config.num_chunks + 1))
     for report, rounds in zip(reports, either.metrics, strict=True):
         assert set(report.metrics) == set(rounds) == METRICS
@@ -286,12 +293,12 @@ def test_reports_say_what_the_rounds_did(either: Trained) -> None:
 
 def test_smoke_counts_its_updates_and_lowers_epsilon_as_worked_out_by_hand(smoke: Trained) -> None:
     # 60 steps in windows of 30, 16 robots in minibatches of 8: four updates a round, four rounds.
-    assert loop.num_windows(smoke.config, smoke.world) == 2
-    assert loop.updates_a_round(smoke.config, smoke.world) == 4
+    assert smoke.program.num_windows == 2
+    assert smoke.program.updates_per_round == 4
     updates = np.concatenate([chunk["updates"] for chunk in smoke.metrics])
     assert updates.tolist() == [4, 8, 12, 16]
     assert int(smoke.final.learner.num_updates) == 16
-    assert int(smoke.final.round) == 4
+    assert int(smoke.final.learner.round) == 4
     # From 0.5 towards 0.05 in quarters of 0.45.
     epsilons = np.concatenate([chunk["epsilon"] for chunk in smoke.metrics])
     np.testing.assert_allclose(epsilons, [0.5, 0.3875, 0.275, 0.1625], rtol=1e-5)
@@ -300,7 +307,7 @@ def test_smoke_counts_its_updates_and_lowers_epsilon_as_worked_out_by_hand(smoke
 def test_a_falling_learning_rate_is_zero_after_the_last_update_of_the_run(smoke: Trained) -> None:
     learner = dataclasses.replace(smoke.config.learner, learning_rate_schedule="linear")
     config = dataclasses.replace(smoke.config, learner=learner)
-    optimizer = loop.optimizer_of(config, smoke.world)
+    optimizer = make_program(smoke.world, config).optimizer
     params = {"w": jnp.zeros(1)}
     opt_state, steps = optimizer.init(params), []
     for _ in range(17):
@@ -317,29 +324,30 @@ def test_the_small_paper_run_waits_for_its_replay_and_then_updates(paper: Traine
     assert updates.tolist() == [0, 4, 8, 12, 16, 20]
     assert np.isnan(losses[0])
     assert np.isfinite(losses[1:]).all()
-    assert int(paper.final.memory.size) == 8
-    assert (np.asarray(paper.final.memory.priorities) > 0).all()
+    assert int(paper.final.learner.memory.size) == 8
+    assert (np.asarray(paper.final.learner.memory.priorities) > 0).all()
 
 
 def test_memory_is_foretold_to_the_byte(paper: Trained) -> None:
-    replay_bytes = sum(array.nbytes for array in jax.tree.leaves(paper.final.memory))
+    replay_bytes = sum(array.nbytes for array in jax.tree.leaves(paper.final.learner.memory))
     # A round: 25 observations of 73 floats, 24 steps of 9 bytes, 128 floats, for four robots.
     round_bytes = 4 * (25 * 73 * 4 + 24 * (4 + 4 + 1) + 128 * 4)
-    assert loop.memory_bytes(paper.config, paper.world) == replay_bytes + round_bytes
-    two_seeds = dataclasses.replace(paper.config, num_seeds=2)
-    assert loop.memory_bytes(two_seeds, paper.world) == 2 * (replay_bytes + round_bytes)
+    assert memory_bytes(paper.world, paper.program) == replay_bytes + round_bytes
+    two_seeds = make_program(paper.world, dataclasses.replace(paper.config, num_seeds=2))
+    assert memory_bytes(paper.world, two_seeds) == 2 * (replay_bytes + round_bytes)
 
 
 def test_the_replay_of_the_paper_preset_fits_in_half_a_gigabyte(maze: EnvParams) -> None:
     assert maze.max_steps == 400
-    assert loop.memory_bytes(PRESETS["paper"], maze) < 0.5e9
+    assert memory_bytes(maze, make_program(maze, PRESETS["paper"])) < 0.5e9
 
 
 def test_the_quick_preset_trains_for_a_chunk(maze: EnvParams) -> None:
     config = small_quick()
     world = world_of(config, maze)
+    program = make_program(world, config)
     with compiling_quickly():
-        _, report = next(loop.run(loop.start_run(world, config), world, config))
+        _, report = next(loop.run(loop.start_run(world, program), world, program))
     assert set(report.metrics) == METRICS
     assert np.isfinite(report.metrics["loss"])
     assert report.metrics["updates"] == config.rounds_per_chunk * 2
@@ -349,7 +357,7 @@ def test_a_window_that_does_not_divide_the_episode_is_refused_by_name(smoke: Tra
     learner = dataclasses.replace(smoke.config.learner, window_length=7)
     config = dataclasses.replace(smoke.config, learner=learner)
     with pytest.raises(ValueError, match=r"^learner.window_length is 7, expected a divisor .* 60"):
-        loop.start_run(smoke.world, config)
+        make_program(smoke.world, config)
     # r2d2 stores whole episodes and has no windows.
     whole = dataclasses.replace(config, method="r2d2", replay=ReplayConfig(32, 16))
-    assert loop.num_windows(whole, smoke.world) == 1
+    assert make_program(smoke.world, whole).num_windows == 1

@@ -52,7 +52,7 @@ def test_a_program_takes_its_arguments_results_and_what_is_in_between() -> None:
 
     compiled = jax.jit(program).lower(jnp.ones(1000)).compile()
     # A million numbers in between, twice at most; 8 kB in and out.
-    assert 4e6 <= memory_budget.program_bytes(compiled) <= 3 * 4e6
+    assert 4e6 <= memory_budget.compiled_bytes(compiled) <= 3 * 4e6
 
 
 def test_a_device_that_is_not_there_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,7 @@
-"""What several devices do together when each holds a share of the robots.
+"""What several devices do together when each has a shard of the robots.
 
-Everything takes the name of the axis that shares lie along, and without one stands for a single
-device that holds all.
+Everything takes the name of the axis that the shards lie along; None stands for a single device,
+which has all.
 """
 
 from __future__ import annotations
@@ -13,9 +13,12 @@ import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+AXIS = "devices"
+"""Name of the axis of a run's devices."""
 
-def own_share(tree: Any, axis_name: str | None, axis: int = 0) -> Any:
-    """This device's rows along `axis` of arrays that all devices hold."""
+
+def own_shard(tree: Any, axis_name: str | None, axis: int = 0) -> Any:
+    """This device's rows along `axis` of arrays that all devices have."""
     if axis_name is None:
         return tree
 
@@ -27,11 +30,11 @@ def own_share(tree: Any, axis_name: str | None, axis: int = 0) -> Any:
     return jax.tree.map(cut, tree)
 
 
-def all_shares(share: Array, axis_name: str | None) -> Array:
-    """The rows of all devices, one device's after the other's; the inverse of `own_share`."""
+def all_shards(shard: Array, axis_name: str | None) -> Array:
+    """The rows of all devices, one device's after the other's; the inverse of `own_shard`."""
     if axis_name is None:
-        return share
-    return jax.lax.all_gather(share, axis_name, tiled=True)
+        return shard
+    return jax.lax.all_gather(shard, axis_name, tiled=True)
 
 
 def mean(tree: Any, axis_name: str | None) -> Any:
@@ -46,10 +49,10 @@ def mean(tree: Any, axis_name: str | None) -> Any:
 
 
 def take(tree: Any, rows: Array, columns: Array, axis_name: str | None) -> Any:
-    """Own share of the items [B, ...] at places of arrays whose columns lie on several devices.
+    """Own shard of the items [B, ...] at places of arrays whose columns lie on several devices.
 
     Args:
-        tree: of [R, C, ...] arrays, of which each device holds as many columns as any other.
+        tree: of [R, C, ...] arrays, of which each device has as many columns as any other.
         rows: [B] in 0..R - 1.
         columns: [B] in 0..C - 1, counted over all devices.
         axis_name: of the devices.
@@ -61,14 +64,14 @@ def take(tree: Any, rows: Array, columns: Array, axis_name: str | None) -> Any:
         return jax.tree.map(lambda x: x[rows, columns], tree)
 
     def fetch(array: Array) -> Array:
-        share = array.shape[1]
-        own = columns - jax.lax.axis_index(axis_name) * share
-        held = (own >= 0) & (own < share)
-        items = array[rows, jnp.clip(own, 0, share - 1)].astype(_summable(array.dtype))
+        width = array.shape[1]
+        own = columns - jax.lax.axis_index(axis_name) * width
+        is_here = (own >= 0) & (own < width)
+        items = array[rows, jnp.clip(own, 0, width - 1)].astype(_summable(array.dtype))
         # Each item is on one device only: with zeros from all others, their sum is the item.
-        items = jnp.where(jnp.expand_dims(held, tuple(range(1, items.ndim))), items, 0)
-        sent = jax.lax.psum_scatter(items, axis_name, tiled=True)
-        return sent.astype(array.dtype)
+        items = jnp.where(jnp.expand_dims(is_here, tuple(range(1, items.ndim))), items, 0)
+        summed = jax.lax.psum_scatter(items, axis_name, tiled=True)
+        return summed.astype(array.dtype)
 
     return jax.tree.map(fetch, tree)
 

@@ -1,0 +1,94 @@
+"""What stays the same during a run, bound once: the settings, and what follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import optax
+from jax.sharding import Mesh
+
+from sqn_jax.agent.networks import QNetwork, make_network
+from sqn_jax.agent.shards import AXIS
+from sqn_jax.config import LearnerConfig, TrainConfig
+
+
+@dataclass(frozen=True)
+class Program:
+    """The last argument of all that trains; static in compiled functions.
+
+    Two of equal fields are equal, and one compiled function serves both: network and optimizer
+    follow from the fields, are made once and not compared.
+
+    Raises:
+        ValueError: the window does not divide the episode.
+    """
+
+    config: TrainConfig
+    max_steps: int
+    """Steps of an episode, which may depend on the map."""
+    num_actions: int
+    """A."""
+    mesh: Mesh | None = None
+    """The devices that the robots are divided between; None for one alone."""
+
+    def __post_init__(self) -> None:
+        if self.max_steps % self.window_length:
+            raise ValueError(
+                f"learner.window_length is {self.window_length}, expected a divisor of the "
+                f"episode's {self.max_steps} steps"
+            )
+
+    @cached_property
+    def network(self) -> QNetwork:
+        """The agent."""
+        return make_network(self.config.algo, self.config.network, self.num_actions)
+
+    @cached_property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Its schedule spans the run."""
+        return make_optimizer(self.config.learner, self.total_updates)
+
+    @property
+    def axis_name(self) -> str | None:
+        """Of the devices, for what they do together; None for one alone."""
+        return None if self.mesh is None else AXIS
+
+    @property
+    def window_length(self) -> int:
+        """Steps of a robot between two calls of `learn`: the whole episode for `r2d2`."""
+        window = self.config.learner.window_length if self.config.method == "pqn" else 0
+        return window or self.max_steps
+
+    @property
+    def num_windows(self) -> int:
+        """Windows of an episode."""
+        return self.max_steps // self.window_length
+
+    @property
+    def num_minibatches(self) -> int:
+        """Minibatches that `pqn` divides the robots into."""
+        return self.config.num_envs // self.config.learner.batch_size
+
+    @property
+    def updates_per_round(self) -> int:
+        """Updates of the network in one round, once learning has begun."""
+        if self.config.method == "r2d2":
+            return self.config.updates_per_round
+        return self.num_windows * self.num_minibatches * self.config.learner.num_passes
+
+    @property
+    def total_updates(self) -> int:
+        """Updates of the whole run, those included that `r2d2` leaves out at first."""
+        return self.config.num_rounds * self.updates_per_round
+
+
+def make_optimizer(config: LearnerConfig, total_updates: int) -> optax.GradientTransformation:
+    """Adam with gradients clipped by their global norm and the configured schedule."""
+    learning_rate: float | optax.Schedule = config.learning_rate
+    if config.learning_rate_schedule == "linear":
+        learning_rate = optax.linear_schedule(config.learning_rate, 0.0, total_updates)
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adam(learning_rate, eps=config.adam_epsilon),
+    )

@@ -1,0 +1,107 @@
+"""The state of a run: how it begins, and what shape, size and place its arrays have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+from jax.sharding import PartitionSpec
+
+from sqn_jax.agent import r2d2, replay
+from sqn_jax.agent.experience import Episodes
+from sqn_jax.agent.learner import LearnerState, init_learner
+from sqn_jax.agent.networks import Params, initial_carry, make_network
+from sqn_jax.agent.program import Program
+from sqn_jax.agent.replay import ReplayState
+from sqn_jax.agent.shards import AXIS
+from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.env import NUM_ACTIONS, EnvParams, Observation
+from sqn_jax.training.devices import REPLICATED
+from sqn_jax.training.rollout import draw_chance, start_fleet, unroll
+
+
+@struct.dataclass
+class RunnerState:
+    """Everything a run needs to go on; with several seeds, each array has a leading axis [K]."""
+
+    learner: LearnerState
+    """Parameters, optimizer, replay and counters."""
+    key: Array
+    """Randomness still to come."""
+
+
+def init_runner(key: Array, env_params: EnvParams, program: Program) -> RunnerState:
+    """The state of one run before its first round; the key is consumed."""
+    # The second is not used: with two children, a seed would give another run than it always has.
+    learner_key, _, run_key = jax.random.split(key, 3)
+    memory = None
+    if program.config.method == "r2d2":
+        memory = r2d2.init_memory(trajectory_shapes(env_params, program), program)
+    learner = init_learner(learner_key, example_obs(program.config.env), program, memory)
+    return RunnerState(learner=learner, key=run_key)
+
+
+def example_obs(config: EnvConfig) -> Observation:
+    """Zeros in the shape of an observation of one step of one robot, [1, 1, ...]."""
+    goal_size = 2 if config.heading_encoding == "linear" else 3
+    return Observation(
+        ranges=jnp.zeros((1, 1, config.num_beams)), goal=jnp.zeros((1, 1, goal_size))
+    )
+
+
+def params_shapes(config: TrainConfig) -> Params:
+    """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
+
+    They follow from the config alone: the map need not be at hand.
+    """
+    network = make_network(config.algo, config.network, NUM_ACTIONS)
+    obs, carry = example_obs(config.env), initial_carry(config.network, 1)
+    shapes = jax.eval_shape(network.init, jax.random.key(0), obs, carry)
+    seeds = () if config.num_seeds == 1 else (config.num_seeds,)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)
+
+
+def trajectory_shapes(env_params: EnvParams, program: Program) -> Episodes:
+    """Shapes and dtypes of what `learn` is given, without computing anything."""
+    network, num_envs = program.network, program.config.num_envs
+
+    def one_unroll(key: Array) -> Episodes:
+        actors = start_fleet(jax.random.split(key, num_envs), network, env_params)
+        params = network.init(key, jax.tree.map(lambda x: x[None], actors.obs), actors.carry)
+        draws = draw_chance(key, program.window_length, num_envs)
+        return unroll(draws, network, params, actors, jnp.zeros(num_envs), env_params)[1]
+
+    return jax.eval_shape(one_unroll, jax.random.key(0))
+
+
+def memory_bytes(env_params: EnvParams, program: Program) -> int:
+    """Bytes that the replay of all seeds and the episodes of a round will take, on all devices."""
+    config = program.config
+    trajectory = trajectory_shapes(env_params, program)
+    total = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(trajectory))
+    if config.method == "r2d2":
+        total += replay.num_bytes(r2d2.packed_item(trajectory), config.replay.capacity)
+    return config.num_seeds * total
+
+
+def runner_specs(program: Program) -> RunnerState:
+    """How the arrays of a state are divided between devices: only what the replay stores is."""
+    each: Any = REPLICATED
+    memory: Any = None
+    if program.config.method == "r2d2":
+        seeds = () if program.config.num_seeds == 1 else (None,)
+        stored: Any = PartitionSpec(*seeds, None, AXIS)
+        memory = ReplayState(stored, each, each, each, each)
+    learner = LearnerState(
+        params=each,
+        target_params=each,
+        opt_state=each,
+        memory=memory,
+        round=each,
+        num_updates=each,
+        num_skipped=each,
+    )
+    return RunnerState(learner=learner, key=each)
