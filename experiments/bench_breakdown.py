@@ -18,7 +18,7 @@ from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
 from sqn_jax.env.dynamics import move
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import loop
-from sqn_jax.training.rollout import draw_chance, start_fleet, unroll
+from sqn_jax.training.rollout import random_draws, start_actors, unroll
 
 Piece = Callable[[EnvState, Array, EnvParams], tuple[EnvState, Any]]
 """One part of a step of one robot: state, action and world to the next state and a result."""
@@ -91,25 +91,26 @@ def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Program
     runner = loop.start_run(params, config)
     key = jax.random.key(1)
     keys = jax.random.split(key, config.num_envs)
-    fleet = jax.jit(lambda keys, params: start_fleet(keys, network, params))(keys, params)
+    actors = jax.jit(lambda keys, params: start_actors(keys, params, network))(keys, params)
     num_steps = params.max_steps // loop.num_windows(config, params)
     epsilon = jnp.zeros(config.num_envs)
 
     @jax.jit
-    def drive(learner: Any, fleet: Any, params: EnvParams) -> Any:
-        chance = draw_chance(key, num_steps, config.num_envs)
-        return unroll(chance, network, learner.params, fleet, epsilon, params)[1]
+    def act(learner: Any, actors: Any, params: EnvParams) -> Any:
+        draws = random_draws(key, num_steps, config.num_envs)
+        _, trajectory = unroll(draws, learner.params, actors, epsilon, params, network)
+        return trajectory.for_learning()
 
     optimizer = loop.optimizer_of(config, params)
 
     @jax.jit
-    def learn(learner: Any, episodes: Any) -> Any:
-        return pqn.learn(key, learner, None, episodes, network, optimizer, config)[0]
+    def learn(learner: Any, trajectory: Any) -> Any:
+        return pqn.learn(key, learner, None, trajectory, network, optimizer, config)[0]
 
-    episodes = drive(runner.learner, fleet, params)
+    trajectory = act(runner.learner, actors, params)
     return {
-        "drive a window": lambda turn: drive(runner.learner, fleet, params),
-        "learn from a window": lambda turn: learn(runner.learner, episodes),
+        "drive a window": lambda turn: act(runner.learner, actors, params),
+        "learn from a window": lambda turn: learn(runner.learner, trajectory),
     }
 
 

@@ -25,7 +25,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from experiments.operations import update_operations
 from experiments.timing import Program, Timing, four_digits, time_in_turns
-from sqn_jax.agent import Episodes, QNetwork, r2d2, replay
+from sqn_jax.agent import QNetwork, Trajectory, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.replay import ReplayState
@@ -54,14 +54,14 @@ class Problem:
     learner: LearnerState
     memory: ReplayState
     """A full replay of random episodes."""
-    episodes: Episodes
+    episodes: Trajectory
     """[U, ...] a batch for each update."""
     weights: Array
     """[U, B] their importance weights."""
 
-    def batch(self, index: int) -> tuple[Episodes, Array]:
+    def batch(self, index: int) -> tuple[Trajectory, Array]:
         """Episodes and weights of one update."""
-        batch: tuple[Episodes, Array] = jax.tree.map(
+        batch: tuple[Trajectory, Array] = jax.tree.map(
             lambda x: x[index], (self.episodes, self.weights)
         )
         return batch
@@ -91,9 +91,9 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     )
 
 
-def random_episodes(rng: np.random.Generator, shapes: Episodes) -> Episodes:
+def random_episodes(rng: np.random.Generator, shapes: Trajectory) -> Trajectory:
     """Observations in 0..1, all actions, rewards around 0, no true end."""
-    return Episodes(
+    return Trajectory(
         obs=jax.tree.map(lambda x: jnp.asarray(rng.random(x.shape), x.dtype), shapes.obs),
         actions=jnp.asarray(rng.integers(NUM_ACTIONS, size=shapes.actions.shape), jnp.int32),
         rewards=jnp.asarray(rng.normal(size=shapes.rewards.shape), jnp.float32),
@@ -104,7 +104,7 @@ def random_episodes(rng: np.random.Generator, shapes: Episodes) -> Episodes:
 
 def update_from_drawn(
     state: LearnerState,
-    batch: tuple[Episodes, Array],
+    batch: tuple[Trajectory, Array],
     *,
     network: QNetwork,
     optimizer: optax.GradientTransformation,
@@ -141,7 +141,7 @@ def drawn_program(problem: Problem, mesh: Mesh | None) -> Program:
     batches = (problem.episodes, problem.weights)
     robots: Any = PartitionSpec(None, devices.AXIS)
     steps: Any = PartitionSpec(None, None, devices.AXIS)
-    divided = (Episodes(steps, steps, steps, steps, robots), robots)
+    divided = (Trajectory(steps, steps, steps, steps, robots), robots)
     scan = _scan(problem, update, mesh, WHOLE, divided, (robots, WHOLE))
     placed = devices.place(batches, mesh, divided)
     return _carried_on(

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.networks import Params, QNetwork, QOutput
 from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import LearnerConfig
 
 
@@ -34,7 +34,7 @@ def r2d2_loss(
     params: Params,
     target_params: Params,
     network: QNetwork,
-    episodes: Episodes,
+    trajectory: Trajectory,
     weights: Array,
     config: LearnerConfig,
     discount: Array | float | None = None,
@@ -49,7 +49,7 @@ def r2d2_loss(
         params: online parameters.
         target_params: target parameters.
         network: one of the three.
-        episodes: [T (+ 1), B, ...].
+        trajectory: [T (+ 1), B, ...].
         weights: [B] importance-sampling weights.
         config: the learner's settings.
         discount: the discount of the moment; `config.discount` if None.
@@ -58,13 +58,13 @@ def r2d2_loss(
         The loss and its by-products.
     """
     burn_in = config.burn_in_length
-    online = _values_after_burn_in(network, params, episodes, burn_in)
-    target = _values_after_burn_in(network, target_params, episodes, burn_in)
+    online = _values_after_burn_in(network, params, trajectory, burn_in)
+    target = _values_after_burn_in(network, target_params, trajectory, burn_in)
     chooser = online if config.double_q else target
     best_action = jnp.argmax(chooser.q_values, axis=-1)
     bootstrap = jax.lax.stop_gradient(_pick(target.q_values, best_action))
     learned = jax.tree.map(
-        lambda x: x[burn_in:], (episodes.actions, episodes.rewards, episodes.terminated)
+        lambda x: x[burn_in:], (trajectory.actions, trajectory.rewards, trajectory.terminated)
     )
     multi_step = partial(n_step_targets, n_step=config.n_step)
     return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
@@ -73,7 +73,7 @@ def r2d2_loss(
 def pqn_loss(
     params: Params,
     network: QNetwork,
-    episodes: Episodes,
+    trajectory: Trajectory,
     config: LearnerConfig,
     discount: Array | float | None = None,
 ) -> tuple[Array, LossOutput]:
@@ -82,24 +82,24 @@ def pqn_loss(
     The steps are fresh, so the recurrent state they were driven with serves as the first one;
     there is no burn-in, no replay and no target network. Arguments as for `r2d2_loss`.
     """
-    online = _values_after_burn_in(network, params, episodes, 0)
+    online = _values_after_burn_in(network, params, trajectory, 0)
     bootstrap = jax.lax.stop_gradient(online.q_values.max(axis=-1))
-    learned = (episodes.actions, episodes.rewards, episodes.terminated)
+    learned = (trajectory.actions, trajectory.rewards, trajectory.terminated)
     multi_step = partial(lambda_targets, trace_decay=config.trace_decay)
-    weights = jnp.ones(episodes.rewards.shape[1])
+    weights = jnp.ones(trajectory.rewards.shape[1])
     return _squared_error(online, bootstrap, learned, multi_step, weights, config, discount)
 
 
 def _values_after_burn_in(
-    network: QNetwork, params: Params, episodes: Episodes, burn_in_length: int
+    network: QNetwork, params: Params, trajectory: Trajectory, burn_in_length: int
 ) -> QOutput:
     """Outputs for the observations from `burn_in_length` on, warmed up on those before."""
-    carry = episodes.carry
+    carry = trajectory.carry
     if burn_in_length > 0:
-        warm_up = jax.tree.map(lambda x: x[:burn_in_length], episodes.obs)
+        warm_up = jax.tree.map(lambda x: x[:burn_in_length], trajectory.obs)
         carry, _ = network.apply(params, warm_up, carry)
         carry = jax.lax.stop_gradient(carry)
-    learned = jax.tree.map(lambda x: x[burn_in_length:], episodes.obs)
+    learned = jax.tree.map(lambda x: x[burn_in_length:], trajectory.obs)
     return cast(QOutput, network.apply(params, learned, carry)[1])
 
 

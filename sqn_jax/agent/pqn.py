@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.learner import LearnerState, average_params, gradient_step
 from sqn_jax.agent.loss import pqn_loss
 from sqn_jax.agent.networks import QNetwork
+from sqn_jax.agent.trajectory import Trajectory, over_robots
 from sqn_jax.config import TrainConfig
 
 
@@ -27,7 +27,7 @@ def learn(
     key: Array,
     state: LearnerState,
     memory: None,
-    episodes: Episodes,
+    trajectory: Trajectory,
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
@@ -42,7 +42,7 @@ def learn(
     """
     del key
     num_batches = config.num_envs // config.learner.batch_size
-    batches = split_robots(episodes, num_batches)
+    batches = split_robots(trajectory, num_batches)
     update = partial(
         _update,
         network=network,
@@ -59,7 +59,7 @@ def learn(
     return state, memory, jax.tree.map(jnp.mean, metrics)
 
 
-def split_robots(episodes: Episodes, num_batches: int) -> Episodes:
+def split_robots(trajectory: Trajectory, num_batches: int) -> Trajectory:
     """N robots to M minibatches: [T, N, ...] becomes [M, T, N / M, ...], [N, H] [M, N / M, H]."""
 
     def split(array: Array, axis: int) -> Array:
@@ -67,18 +67,12 @@ def split_robots(episodes: Episodes, num_batches: int) -> Episodes:
         grouped = array.reshape(*shape[:axis], -1, num_batches, *shape[axis + 1 :])
         return jnp.moveaxis(grouped, axis + 1, 0)
 
-    return Episodes(
-        obs=jax.tree.map(partial(split, axis=1), episodes.obs),
-        actions=split(episodes.actions, 1),
-        rewards=split(episodes.rewards, 1),
-        terminated=split(episodes.terminated, 1),
-        carry=split(episodes.carry, 0),
-    )
+    return over_robots(split, trajectory.for_learning())
 
 
 def _update(
     state: LearnerState,
-    episodes: Episodes,
+    trajectory: Trajectory,
     *,
     network: QNetwork,
     optimizer: optax.GradientTransformation,
@@ -87,7 +81,7 @@ def _update(
     axis_name: str | None,
 ) -> tuple[LearnerState, dict[str, Array]]:
     def loss_function(params: Any) -> Any:
-        return pqn_loss(params, network, episodes, config.learner, discount)
+        return pqn_loss(params, network, trajectory, config.learner, discount)
 
     state, _, metrics = gradient_step(state, optimizer, loss_function, axis_name)
     if state.target_params is not None:

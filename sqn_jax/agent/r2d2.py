@@ -18,12 +18,12 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent import replay
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.learner import LearnerState, gradient_step, update_target
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.networks import QNetwork
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shares import all_shares
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 
 
@@ -41,25 +41,25 @@ class PackedEpisodes:
     """[N, T] bool."""
 
 
-def pack(episodes: Episodes) -> PackedEpisodes:
+def pack(trajectory: Trajectory) -> PackedEpisodes:
     """Whole time-major episodes to compact items."""
     compact = PackedEpisodes(
         obs=dataclasses.replace(
-            episodes.obs,
-            ranges=jnp.round(episodes.obs.ranges * 255).astype(jnp.uint8),
-            goal=jnp.round(episodes.obs.goal * 65535).astype(jnp.uint16),
+            trajectory.obs,
+            ranges=jnp.round(trajectory.obs.ranges * 255).astype(jnp.uint8),
+            goal=jnp.round(trajectory.obs.goal * 65535).astype(jnp.uint16),
         ),
-        actions=episodes.actions.astype(jnp.uint8),
-        rewards=episodes.rewards,
-        terminated=episodes.terminated,
+        actions=trajectory.actions.astype(jnp.uint8),
+        rewards=trajectory.rewards,
+        terminated=trajectory.terminated,
     )
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), compact)
 
 
-def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
+def unpack(items: PackedEpisodes, hidden_size: int) -> Trajectory:
     """The inverse of `pack`, to the rounding of the integers; the recurrent state is zero."""
     compact = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), items)
-    return Episodes(
+    return Trajectory(
         obs=dataclasses.replace(
             compact.obs,
             ranges=compact.obs.ranges.astype(jnp.float32) / 255,
@@ -72,9 +72,9 @@ def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
     )
 
 
-def packed_item(episodes: Episodes) -> Any:
+def packed_item(trajectory: Trajectory) -> Any:
     """Shapes and dtypes of one stored episode, from episodes given as shapes or arrays."""
-    packed = jax.eval_shape(pack, episodes)
+    packed = jax.eval_shape(pack, trajectory)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
 
 
@@ -82,7 +82,7 @@ def learn(
     key: Array,
     state: LearnerState,
     memory: ReplayState,
-    episodes: Episodes,
+    trajectory: Trajectory,
     network: QNetwork,
     optimizer: optax.GradientTransformation,
     config: TrainConfig,
@@ -94,7 +94,7 @@ def learn(
     With the name of an axis of devices, each stores its share of the round and learns from its
     share of every minibatch; all are given the same key.
     """
-    memory = replay.add(memory, pack(episodes))
+    memory = replay.add(memory, pack(trajectory))
     update = partial(
         _update,
         network=network,
@@ -137,11 +137,11 @@ def _update(
         importance_exponent=settings.importance_exponent if settings.prioritized else 0.0,
         axis_name=axis_name,
     )
-    episodes = unpack(items, config.network.hidden_size)
+    trajectory = unpack(items, config.network.hidden_size)
 
     def loss_function(params: Any) -> Any:
         return r2d2_loss(
-            params, state.target_params, network, episodes, weights, config.learner, discount
+            params, state.target_params, network, trajectory, weights, config.learner, discount
         )
 
     state, output, metrics = gradient_step(state, optimizer, loss_function, axis_name)

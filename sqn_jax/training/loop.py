@@ -26,24 +26,23 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from sqn_jax.agent import pqn, r2d2, replay
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, discount_schedule, init_learner, make_optimizer
 from sqn_jax.agent.networks import Params, QNetwork, make_network
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shares import mean, own_share
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.training.devices import AXIS, compiler_options, place, placed_shapes
 from sqn_jax.training.rollout import (
-    Fleet,
-    Trace,
-    draw_chance,
+    ActorState,
+    episode_metrics,
     join_windows,
     own_worlds,
+    random_draws,
     restart_at_goal,
-    start_fleet,
-    summarize,
+    start_actors,
     unroll,
 )
 
@@ -106,17 +105,18 @@ def optimizer_of(config: TrainConfig, env_params: EnvParams) -> optax.GradientTr
     return make_optimizer(config.learner, total)
 
 
-def episode_shapes(config: TrainConfig, env_params: EnvParams) -> Episodes:
+def episode_shapes(config: TrainConfig, env_params: EnvParams) -> Trajectory:
     """Shapes and dtypes of what one unroll hands to the learner, without computing anything."""
     network = network_of(config)
     num_steps = env_params.max_steps // num_windows(config, env_params)
 
-    def one_unroll(key: Array) -> Episodes:
-        fleet = start_fleet(jax.random.split(key, config.num_envs), network, env_params)
-        params = network.init(key, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
+    def one_unroll(key: Array) -> Trajectory:
+        actors = start_actors(jax.random.split(key, config.num_envs), env_params, network)
+        params = network.init(key, jax.tree.map(lambda x: x[None], actors.obs), actors.carry)
         epsilon = jnp.zeros(config.num_envs)
-        chance = draw_chance(key, num_steps, config.num_envs)
-        return unroll(chance, network, params, fleet, epsilon, env_params)[1]
+        draws = random_draws(key, num_steps, config.num_envs)
+        _, trajectory = unroll(draws, params, actors, epsilon, env_params, network)
+        return trajectory.for_learning()
 
     return jax.eval_shape(one_unroll, jax.random.key(0))
 
@@ -134,12 +134,12 @@ def init_runner(key: Array, env_params: EnvParams, config: TrainConfig) -> Runne
     """The state of one run before its first round; the key is consumed."""
     learner_key, obs_key, run_key = jax.random.split(key, 3)
     network = network_of(config)
-    fleet = start_fleet(jax.random.split(obs_key, 1), network, env_params)
+    actors = start_actors(jax.random.split(obs_key, 1), env_params, network)
     learner = init_learner(
         learner_key,
         network,
         optimizer_of(config, env_params),
-        jax.tree.map(lambda x: x[None], fleet.obs),
+        jax.tree.map(lambda x: x[None], actors.obs),
         use_target=config.method == "r2d2" or averages(config),
     )
     memory: ReplayState | None = None
@@ -162,17 +162,17 @@ def train_round(
     With the name of an axis of devices, of this device's share of the robots; the scalars are those
     of all.
     """
-    key, fleet_key, window_key = jax.random.split(runner.key, 3)
+    key, start_key, window_key = jax.random.split(runner.key, 3)
     windows = num_windows(config, env_params)
     progress = runner.round / config.num_rounds
     epsilon = epsilon_per_robot(progress, config.num_envs, config.exploration)
     epsilon = own_share(epsilon, axis_name)
     env_params = own_worlds(env_params, config.randomization, config.num_envs, axis_name)
-    fleet_keys = own_share(jax.random.split(fleet_key, config.num_envs), axis_name)
-    fleet = start_fleet(fleet_keys, network_of(config), env_params)
+    start_keys = own_share(jax.random.split(start_key, config.num_envs), axis_name)
+    actors = start_actors(start_keys, env_params, network_of(config))
     discount = discount_schedule(progress, config.learner)
     body = partial(
-        _drive_and_learn,
+        _act_and_learn,
         epsilon=epsilon,
         discount=discount,
         env_params=env_params,
@@ -180,18 +180,18 @@ def train_round(
         axis_name=axis_name,
     )
     on_first_task = jnp.ones(epsilon.shape[0], bool)
-    first = (runner.learner, runner.memory, fleet, on_first_task)
+    first = (runner.learner, runner.memory, actors, on_first_task)
     keys = jax.random.split(window_key, windows)
-    (learner, memory, _fleet, _first), (traces, learning) = jax.lax.scan(body, first, keys)
-    trace = join_windows(traces)
-    summary = summarize(trace, env_params.goal_radius)
+    (learner, memory, _actors, _first), (trajectories, learning) = jax.lax.scan(body, first, keys)
+    trajectory = join_windows(trajectories)
+    episodes = episode_metrics(trajectory, env_params.goal_radius)
     told = {
-        "mean_reward": summary.mean_reward.mean(),
-        "success": summary.success.mean(),
-        "time_steps": summary.time_steps.mean(),
-        "collisions": summary.collisions.mean(),
-        "covered_area": summary.covered_area.mean(),
-        "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
+        "mean_reward": episodes.mean_reward.mean(),
+        "success": episodes.success.mean(),
+        "time_steps": episodes.time_steps.mean(),
+        "collisions": episodes.collisions.mean(),
+        "covered_area": episodes.covered_area.mean(),
+        "skill_usage": trajectory.output.skill_weights.mean(axis=(0, 1)),
     }
     metrics = mean(told, axis_name) | {
         "updates": learner.num_updates,
@@ -211,8 +211,8 @@ def _is_finite(learner: LearnerState) -> Array:
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats]))
 
 
-def _drive_and_learn(
-    carry: tuple[LearnerState, Any, Fleet, Array],
+def _act_and_learn(
+    carry: tuple[LearnerState, Any, ActorState, Array],
     key: Array,
     *,
     epsilon: Array,
@@ -220,30 +220,33 @@ def _drive_and_learn(
     env_params: EnvParams,
     config: TrainConfig,
     axis_name: str | None,
-) -> tuple[tuple[LearnerState, Any, Fleet, Array], tuple[Trace, dict[str, Array]]]:
-    """One window: drive it, learn from it, and send robots that have arrived to new goals.
+) -> tuple[tuple[LearnerState, Any, ActorState, Array], tuple[Trajectory, dict[str, Array]]]:
+    """One window: act, learn from it, and send robots that have arrived to new goals.
 
     To the learner a new task is a truncation, as the end of every window is one: it has already
     seen the last observation of the old one. Success and time steps are those of first tasks.
     """
-    learner, memory, fleet, on_first_task = carry
+    learner, memory, actors, on_first_task = carry
     unroll_key, learn_key, restart_key = jax.random.split(key, 3)
     network = network_of(config)
     num_steps = env_params.max_steps // num_windows(config, env_params)
-    chance = own_share(draw_chance(unroll_key, num_steps, config.num_envs), axis_name, axis=1)
-    fleet, episodes, trace = unroll(chance, network, learner.params, fleet, epsilon, env_params)
+    draws = own_share(random_draws(unroll_key, num_steps, config.num_envs), axis_name, axis=1)
+    actors, trajectory = unroll(draws, learner.params, actors, epsilon, env_params, network)
     learn = r2d2.learn if config.method == "r2d2" else pqn.learn
     optimizer = optimizer_of(config, env_params)
     learner, memory, metrics = learn(
-        learn_key, learner, memory, episodes, network, optimizer, config, discount, axis_name
+        learn_key, learner, memory, trajectory, network, optimizer, config, discount, axis_name
     )
-    distances = jnp.where(on_first_task[None], trace.goal_distances, jnp.inf)
-    trace = dataclasses.replace(trace, goal_distances=distances)
+    distances = jnp.where(on_first_task[None], trajectory.info["goal_distance"], jnp.inf)
+    trajectory = dataclasses.replace(
+        trajectory.only("rewards", "poses", "goals", "output"),
+        info=trajectory.info | {"goal_distance": distances},
+    )
     if config.method == "pqn" and config.learner.restart_at_goal:
         restart_keys = own_share(jax.random.split(restart_key, config.num_envs), axis_name)
-        fleet, restarted = restart_at_goal(restart_keys, fleet, network, env_params)
+        actors, restarted = restart_at_goal(restart_keys, actors, env_params, network)
         on_first_task &= ~restarted
-    return (learner, memory, fleet, on_first_task), (trace, metrics)
+    return (learner, memory, actors, on_first_task), (trajectory, metrics)
 
 
 def train_chunk(

@@ -13,7 +13,7 @@ import pytest
 from learning_oracle import adam_step
 from small_problems import HIDDEN, of_robots, random_episodes, random_params, small_network
 
-from sqn_jax.agent import Episodes, pqn, r2d2, replay
+from sqn_jax.agent import Trajectory, pqn, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, discount_schedule, make_optimizer
 from sqn_jax.agent.loss import pqn_loss, r2d2_loss
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
@@ -179,7 +179,7 @@ def test_pqn_sees_every_episode_equally_often(
     episodes = random_episodes(np.random.default_rng(33), LENGTH, 6)
     seen: list[list[int]] = []
 
-    def note_robots(params: Any, network: Any, part: Episodes, *_: Any) -> None:
+    def note_robots(params: Any, network: Any, part: Trajectory, *_: Any) -> None:
         assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
         # Rewards are random, so that they tell which robot's they are.
         same = np.asarray(part.rewards[:, :, None] == episodes.rewards[:, None]).all(axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from small_problems import as_batch, in_float64, random_episodes, random_params, small_network
 
-from sqn_jax.agent import Episodes
+from sqn_jax.agent import Trajectory
 from sqn_jax.agent.loss import gate_entropy, pqn_loss, r2d2_loss, skill_distance
 from sqn_jax.config import LearnerConfig
 
@@ -39,7 +39,7 @@ class Problem:
     network: Any
     params: Any
     target_params: Any
-    episodes: Episodes
+    episodes: Trajectory
 
 
 def problem(algo: str, seed: int = 20, **kwargs: Any) -> Problem:
@@ -255,7 +255,7 @@ def test_what_was_done_and_earned_in_burn_in_does_not_matter() -> None:
 def test_the_last_observation_counts_at_a_time_limit_and_not_after_a_true_end(method: str) -> None:
     given = problem("sqn", layer_norm=method == "pqn")
 
-    def last_errors(episodes: Episodes) -> np.ndarray:
+    def last_errors(episodes: Trajectory) -> np.ndarray:
         if method == "r2d2":
             output = r2d2(dataclasses.replace(given, episodes=episodes), CONFIG)[1]
         else:
