@@ -21,9 +21,9 @@ from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.baselines.bug import BugNavigator
 from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
-from sqn_jax.evaluation.episodes import start_by_hand, step_by_hand
+from sqn_jax.evaluation.episodes import metrics_of, start_by_hand, step_by_hand
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.training.rollout import EpisodeMetrics, episode_metrics, with_ends
+from sqn_jax.training.rollout import EpisodeMetrics, with_ends
 
 Ints = NDArray[np.int64]
 Choose = Callable[[Observation, EnvState], Ints]
@@ -97,11 +97,7 @@ def run_baseline(
     trajectory = with_ends(stacked, first, actors)
     trajectory = dataclasses.replace(trajectory, output=_one_skill(stacked))
     radii = goal_radii or [float(env_params.goal_radius)]
-    metrics = [episode_metrics(trajectory, jnp.float32(radius)) for radius in radii]
-    found: tuple[list[EpisodeMetrics], Trajectory] = jax.device_get(
-        (metrics, trajectory.only(*fields))
-    )
-    return found
+    return metrics_of(trajectory, radii), jax.device_get(trajectory.only(*fields))
 
 
 def _one_skill(steps: Trajectory) -> QOutput:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.agent.trajectory import Trajectory, over_robots
@@ -86,35 +88,45 @@ def run_episodes(
     Returns:
         For each radius one number an episode [E], and the fields of all episodes; NumPy arrays.
     """
-    radii = jnp.asarray(goal_radii or [env_params.goal_radius], jnp.float32)
-    metrics: list[EpisodeMetrics] = []
+    radii = goal_radii or [float(env_params.goal_radius)]
+    metrics: list[list[EpisodeMetrics]] = []
     trajectories: list[Trajectory] = []
     for first in range(0, len(keys), BATCH):
         batch = keys[first : first + BATCH]
         full = batch[jnp.arange(BATCH) % len(batch)]
         own = slice(len(batch))
-        of_batch, trajectory = _run_batch(full, params, env_params, radii, network)
-        of_batch, trajectory = jax.device_get((of_batch, trajectory.only(*fields)))
-        metrics.append(jax.tree.map(lambda x, own=own: x[:, own], of_batch))
-        trajectories.append(trajectory.of_robots(own))
+        trajectory = _run_batch(full, params, env_params, network)
+        metrics.append(jax.tree.map(lambda x, own=own: x[own], metrics_of(trajectory, radii)))
+        trajectories.append(jax.device_get(trajectory.only(*fields)).of_robots(own))
         on_batch(len(batch))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *metrics)
-    return (
-        [jax.tree.map(lambda x, i=i: x[i], joined) for i in range(len(radii))],
-        over_robots(lambda *parts, axis: np.concatenate(parts, axis), *trajectories),
-    )
+
+    def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+        return np.concatenate(parts, axis)
+
+    joined: list[EpisodeMetrics] = jax.tree.map(join, *metrics)
+    return joined, over_robots(join, *trajectories)
 
 
 @partial(jax.jit, static_argnames="network")
-def _run_batch(
-    keys: Array, params: Params, env_params: EnvParams, goal_radii: Array, network: QNetwork
-) -> tuple[EpisodeMetrics, Trajectory]:
-    """One batch; metrics are [radii, BATCH]."""
+def _run_batch(keys: Array, params: Params, env_params: EnvParams, network: QNetwork) -> Trajectory:
     carry = initial_carry(network.config, len(keys))
     draws, actors = start_episodes(keys, carry, env_params)
-    greedy = jnp.zeros(len(keys))
-    _, trajectory = unroll(draws, params, actors, greedy, env_params, network)
-    return jax.vmap(partial(episode_metrics, trajectory))(goal_radii), trajectory
+    _, trajectory = unroll(draws, params, actors, jnp.zeros(len(keys)), env_params, network)
+    return trajectory
+
+
+def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
+    """`episode_metrics` for each radius, m; NumPy arrays [E].
+
+    In a program of their own: whatever the radii, the episodes come from the same one.
+    """
+    needed = trajectory.only("rewards", "poses", "info")
+    metrics = [_metrics(needed, jnp.float32(radius)) for radius in goal_radii]
+    on_host: list[EpisodeMetrics] = jax.device_get(metrics)
+    return on_host
+
+
+_metrics = jax.jit(episode_metrics)
 
 
 @jax.jit
