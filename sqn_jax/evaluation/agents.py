@@ -138,7 +138,7 @@ class Reference:
             choose = baseline_episodes.oracle(world.occupancy_map, world.env_params)
         else:
             choose = baseline_episodes.bug(world.env_params, settings.episodes)
-        found = baseline_episodes.run_baseline(
+        metrics, trajectory = baseline_episodes.run_baseline(
             episodes.episode_keys(key, settings.episodes),
             choose,
             world.env_params,
@@ -146,7 +146,7 @@ class Reference:
             fields=fields,
         )
         on_batch(settings.episodes)
-        return found
+        return metrics, trajectory
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,12 +87,12 @@ def run_baseline(
     """
     step_keys, first = start_by_hand(keys, env_params)
     # Observations of many episodes take much memory, and are mostly not wanted.
-    held = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
+    wanted = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
     actors, steps = first, []
     for keys_of_step in step_keys:
         actions = jnp.asarray(choose(actors.obs, actors.env_state), jnp.int32)
         actors, step = step_by_hand(keys_of_step, actors, actions, env_params)
-        steps.append(jax.device_get(step.only(*held)))
+        steps.append(jax.device_get(step.only(*wanted)))
     stacked = jax.tree.map(lambda *parts: np.stack(parts), *steps)
     trajectory = with_ends(stacked, first, actors)
     trajectory = dataclasses.replace(trajectory, output=_one_skill(stacked))

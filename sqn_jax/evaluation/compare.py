@@ -127,11 +127,11 @@ def evaluate_agents(
                 if world.noise == (0.0, 0.0):
                     quiet[agent.name].append(evaluated[agent.name])
     comparisons = [
-        {"first": first, "second": second, **told}
+        {"first": first, "second": second, **improvement}
         for first in quiet
         for second in quiet
         if first != second
-        and (told := scores.improvement(quiet[first], quiet[second], main_radius))
+        and (improvement := scores.improvement(quiet[first], quiet[second], main_radius))
     ]
     return {"schema": 1, "results": results, "comparisons": comparisons}, records
 

@@ -202,8 +202,8 @@ class Episode:
 
     def covered_bits(self, index: int) -> NDArray[np.bool_]:
         """[..., 32] whether each point of the lattice was seen before step `index` (0..T)."""
-        words = self.trajectory.covered[index]
-        return (words[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
+        covered = self.trajectory.covered[index]
+        return (covered[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
 
     def covered_points(self, index: int) -> Floats:
         """[P, 2] m, the points seen before step `index` (0..T), each for `lattice.cell` squared."""

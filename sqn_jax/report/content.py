@@ -1,4 +1,4 @@
-"""What a report says: the runs as they were found, and what comes of their evaluation."""
+"""What a report says: the runs as they are on the disk, and what comes of their evaluation."""
 
 from __future__ import annotations
 
