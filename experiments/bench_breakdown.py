@@ -18,7 +18,7 @@ from sqn_jax.env import EnvParams, EnvState, coverage, navigation, true_ranges
 from sqn_jax.env.dynamics import move
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import loop
-from sqn_jax.training.rollout import draw_chance, start_fleet, unroll
+from sqn_jax.training.rollout import random_draws, start_actors, unroll
 
 Piece = Callable[[EnvState, Array, EnvParams], tuple[EnvState, Any]]
 """One part of a step of one robot: state, action and world to the next state and a result."""
@@ -86,27 +86,27 @@ def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int
 
 
 def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Timed]:
-    """The two halves of a window of recurrent PQN: drive it, learn from it."""
+    """The two halves of a window of recurrent PQN: roll it out, learn from it."""
     program = loop.make_program(params, config)
     network = program.network
     learner = loop.start_run(params, program).learner
     key = jax.random.key(1)
     keys = jax.random.split(key, config.num_envs)
-    fleet = jax.jit(lambda keys, params: start_fleet(keys, network, params))(keys, params)
+    actors = jax.jit(lambda keys, params: start_actors(keys, params, network))(keys, params)
     epsilon = jnp.zeros(config.num_envs)
 
     @jax.jit
-    def drive(learner: Any, fleet: Any, params: EnvParams) -> Any:
-        chance = draw_chance(key, program.window_length, config.num_envs)
-        return unroll(chance, network, learner.params, fleet, epsilon, params)[1]
+    def rollout(learner: Any, actors: Any, params: EnvParams) -> Any:
+        draws = random_draws(key, program.window_length, config.num_envs)
+        return unroll(draws, learner.params, actors, epsilon, params, network)[1].for_learning()
 
     @jax.jit
     def learn(learner: Any, trajectory: Any) -> Any:
         return pqn.learn(key, learner, trajectory, program)[0]
 
-    trajectory = drive(learner, fleet, params)
+    trajectory = rollout(learner, actors, params)
     return {
-        "drive a window": lambda turn: drive(learner, fleet, params),
+        "roll out a window": lambda turn: rollout(learner, actors, params),
         "learn from a window": lambda turn: learn(learner, trajectory),
     }
 

@@ -24,7 +24,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from experiments.operations import update_operations
 from experiments.timing import Timed, Timing, four_digits, time_in_turns
-from sqn_jax.agent import Episodes, r2d2, replay
+from sqn_jax.agent import Trajectory, r2d2, replay
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.program import Program
@@ -53,14 +53,14 @@ class Problem:
     program: Program
     learner: LearnerState
     """With a full replay of random episodes."""
-    episodes: Episodes
+    episodes: Trajectory
     """[U, ...] a batch for each update."""
     weights: Array
     """[U, B] their importance weights."""
 
-    def batch(self, index: int) -> tuple[Episodes, Array]:
+    def batch(self, index: int) -> tuple[Trajectory, Array]:
         """Episodes and weights of one update."""
-        batch: tuple[Episodes, Array] = jax.tree.map(
+        batch: tuple[Trajectory, Array] = jax.tree.map(
             lambda x: x[index], (self.episodes, self.weights)
         )
         return batch
@@ -88,9 +88,9 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     )
 
 
-def random_episodes(rng: np.random.Generator, shapes: Episodes) -> Episodes:
+def random_episodes(rng: np.random.Generator, shapes: Trajectory) -> Trajectory:
     """Observations in 0..1, all actions, rewards around 0, no true end."""
-    return Episodes(
+    return Trajectory(
         obs=jax.tree.map(lambda x: jnp.asarray(rng.random(x.shape), x.dtype), shapes.obs),
         actions=jnp.asarray(rng.integers(NUM_ACTIONS, size=shapes.actions.shape), jnp.int32),
         rewards=jnp.asarray(rng.normal(size=shapes.rewards.shape), jnp.float32),
@@ -103,13 +103,13 @@ def drawn_program(problem: Problem, mesh: Mesh | None) -> Timed:
     """U updates from the problem's batches, in one compiled scan: no drawing, no storing."""
     program = dataclasses.replace(problem.program, mesh=mesh)
 
-    def update(state: LearnerState, batch: tuple[Episodes, Array]) -> Any:
+    def update(state: LearnerState, batch: tuple[Trajectory, Array]) -> Any:
         state, priorities, metrics = r2d2.learn_from(state, *batch, program)
         return state, (priorities, metrics)
 
     robots: Any = PartitionSpec(None, AXIS)
     steps: Any = PartitionSpec(None, None, AXIS)
-    specs = (Episodes(steps, steps, steps, steps, robots), robots)
+    specs = (Trajectory(steps, steps, steps, steps, robots), robots)
     scan = _scan(update, program, REPLICATED, specs, (robots, REPLICATED))
     batches = devices.place((problem.episodes, problem.weights), mesh, specs)
     learner = devices.place(dataclasses.replace(problem.learner, memory=None), mesh)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common import run
-from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World
+from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.runs.evaluate import evaluate_session
 from sqn_jax.storage.files import write_json
@@ -27,15 +27,15 @@ PUSHING = 0.5
 """A robot pushes if more than this share of its last moves was refused."""
 
 
-def failures(driven: Driven, points: NDArray[np.floating]) -> dict[str, Any]:
+def failures(batch: EpisodeBatch, points: NDArray[np.floating]) -> dict[str, Any]:
     """What E episodes between evaluation points [P, 2] came to."""
-    summaries, trace = driven
-    success = np.asarray(summaries[0].success)
-    poses, goals = np.asarray(trace.poses), np.asarray(trace.goals)
+    success = np.asarray(batch.main_metrics.success)
+    poses, collisions = batch.trajectory.poses, batch.trajectory.info["collision"]
     last = poses[-LAST_STEPS:, ~success, :2]
     still = np.ptp(last, axis=0).max(axis=-1) < STILL if last.size else np.zeros(0, bool)
-    refused = np.asarray(trace.collisions)[-LAST_STEPS:, ~success].mean(axis=0)
-    starts_at, goals_at = (_nearest(places, points) for places in (poses[0, :, :2], goals))
+    refused = collisions[-LAST_STEPS:, ~success].mean(axis=0)
+    starts_at = _nearest(batch.starts[:, :2], points)
+    goals_at = _nearest(batch.goals, points)
     pairs = {}
     for pair in sorted(set(zip(starts_at.tolist(), goals_at.tolist(), strict=True))):
         same = (starts_at == pair[0]) & (goals_at == pair[1])
@@ -71,11 +71,11 @@ def main() -> None:
     agents = [Learnt(word, (find_policy(word),)) for word in options.policies]
     found = {}
 
-    def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
-        points = world.occupancy_map.evaluation_points
-        found[Path(agent.name).name] = failures(driven, points)
+    def keep(batch: EpisodeBatch) -> None:
+        points = batch.world.occupancy_map.evaluation_points
+        found[Path(batch.agent.name).name] = failures(batch, points)
 
-    evaluate_session(agents, settings, on_driven=keep)
+    evaluate_session(agents, settings, on_evaluated=keep, fields=("info",))
     write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": found})
     for name, told in found.items():
         print(

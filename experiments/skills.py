@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from experiments.common import run
-from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World
+from sqn_jax.agent.trajectory import Trajectory
+from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings
 from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy
@@ -38,12 +39,11 @@ def variants(policy: Policy) -> dict[str, Policy]:
     return {AS_IT_IS: policy, **alone, "exchanged": swap_skills(policy)}
 
 
-def weights_by_situation(driven: Driven) -> dict[str, Any]:
+def weights_by_situation(trajectory: Trajectory) -> dict[str, Any]:
     """Mean weights of the skills and the share of steps, before the goal and at it."""
-    trace = driven[1]
-    weights = np.asarray(trace.skill_weights)
-    refused, fresh = np.asarray(trace.collisions), np.asarray(trace.covered_areas) > NEW_GROUND
-    at_goal = np.asarray(trace.goal_distances) < NEAR
+    weights, info = trajectory.output.skill_weights, trajectory.info
+    refused, fresh = info["collision"], info["covered_area"] > NEW_GROUND
+    at_goal = info["goal_distance"] < NEAR
     under_way = ~at_goal & ~refused
     situations = {
         "at the goal": at_goal,
@@ -70,13 +70,13 @@ def main() -> None:
     settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
     found: dict[str, Any] = {}
 
-    def keep(agent: Agent, world: World, _index: int, driven: Driven) -> None:
-        told: dict[str, Any] = {"success": float(np.mean(driven[0][0].success))}
-        if agent.name == AS_IT_IS:
-            told["weights"] = weights_by_situation(driven)
-        found.setdefault(world.occupancy_map.name, {})[agent.name] = told
+    def keep(batch: EpisodeBatch) -> None:
+        told: dict[str, Any] = {"success": float(np.mean(batch.main_metrics.success))}
+        if batch.agent.name == AS_IT_IS:
+            told["weights"] = weights_by_situation(batch.trajectory)
+        found.setdefault(batch.world.occupancy_map.name, {})[batch.agent.name] = told
 
-    evaluate_session(agents, settings, on_driven=keep)
+    evaluate_session(agents, settings, on_evaluated=keep, fields=("info", "output"))
     write_json(options.out, {"policy": options.policy, "episodes": options.episodes, "maps": found})
     for name, entries in found.items():
         for variant, told in entries.items():

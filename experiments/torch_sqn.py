@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.returns import RESCALING_EPSILON
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import LearnerConfig, NetworkConfig
 
 Floats = NDArray[np.float32]
@@ -45,7 +45,7 @@ class Batch:
     """[B] float32."""
 
 
-def to_torch(episodes: Episodes, weights: Any) -> Batch:
+def to_torch(episodes: Trajectory, weights: Any) -> Batch:
     """Copy episodes and importance weights [B] from JAX."""
 
     def tensor(array: Any) -> Tensor:

@@ -144,12 +144,12 @@ except ValueError as error:
 
 # %%
 policy = find_policy("pretrained:sqn")
-driven = {}
+batches = {}
 
 
-def keep(agent, world, index, what):
-    """Keep every summary and trace for the pictures below."""
-    driven[agent.name, world.occupancy_map.name] = what
+def keep(batch):
+    """Keep the episodes for the pictures below."""
+    batches[batch.agent.name, batch.world.occupancy_map.name] = batch
 
 
 def interval(told, digits):
@@ -163,7 +163,8 @@ def measure(agents, *maps):
     settings = Settings(
         maps, episodes=EPISODES, eval_seeds=1, seed=SEED, goal_radii=(0.3,), max_steps=STEPS
     )
-    found, _ = evaluate_agents(agents, load_maps(agents, settings), settings, on_driven=keep)
+    maps = load_maps(agents, settings)
+    found, _ = evaluate_agents(agents, maps, settings, on_evaluated=keep, fields=("output",))
     rows = []
     for entry in found["results"]:
         rows.append([entry["map"], entry["agent"], interval(entry["success"], 3)])
@@ -185,14 +186,14 @@ measure([sqn] if SMALL else with_references([sqn], references=True), str(path))
 
 def paths_of(name, there, max_panels=4):
     """A picture of an agent's paths on a map, a panel for each goal."""
-    (summary,), trace = driven[name, there.name]
+    batch = batches[name, there.name]
     figure = figures.trajectories(
         there,
-        trace.goals,
-        trace.poses,
-        trace.skill_weights,
-        summary.success,
-        summary.time_steps,
+        batch.goals,
+        batch.trajectory.poses,
+        batch.trajectory.output.skill_weights,
+        batch.main_metrics.success,
+        batch.main_metrics.time_steps,
         goal_radius=0.3,
         title=f"{name}, {there.name}",
         max_panels=max_panels,

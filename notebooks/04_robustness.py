@@ -68,12 +68,12 @@ for name, policy in policies.items():
 # ## Success over the levels
 
 # %%
-traces = {}
+batches = {}
 
 
-def keep(agent, world, index, driven):
-    """Keep every summary and trace for the pictures below."""
-    traces[agent.name, world.noise] = driven
+def keep(batch):
+    """Keep the episodes for the pictures below."""
+    batches[batch.agent.name, batch.world.noise] = batch
 
 
 settings = Settings(
@@ -86,7 +86,8 @@ settings = Settings(
     max_steps=STEPS,
 )
 maps = load_maps(agents, settings)
-found, _ = evaluate_agents(agents, maps, settings, on_driven=keep)
+fields = ("info", "output")
+found, _ = evaluate_agents(agents, maps, settings, on_evaluated=keep, fields=fields)
 figures.picture(
     figures.robustness(
         found["results"], title=f"Success on the maze under noise, {EPISODES} episodes a point"
@@ -151,9 +152,9 @@ def sign_test(lost, gained):
 
 rows = []
 for agent in agents:
-    before = np.asarray(traces[agent.name, QUIET][0][0].success)
+    before = batches[agent.name, QUIET].main_metrics.success
     for noise in NOISES[1:]:
-        after = np.asarray(traces[agent.name, noise][0][0].success)
+        after = batches[agent.name, noise].main_metrics.success
         lost, gained = int(np.sum(before & ~after)), int(np.sum(~before & after))
         rows.append([agent.name, level_name(noise), f"{lost}", f"{gained}"])
         p_value = sign_test(lost, gained)
@@ -172,14 +173,14 @@ there = maps["maze", robot.robot_radius]
 
 def failures(agent, noise):
     """A picture of an agent's paths under some noise, failures first."""
-    (summary,), trace = traces[agent, noise]
+    batch = batches[agent, noise]
     figure = figures.trajectories(
         there,
-        trace.goals,
-        trace.poses,
-        trace.skill_weights,
-        summary.success,
-        summary.time_steps,
+        batch.goals,
+        batch.trajectory.poses,
+        batch.trajectory.output.skill_weights,
+        batch.main_metrics.success,
+        batch.main_metrics.time_steps,
         goal_radius=0.3,
         title=f"{agent}, noise: {level_name(noise)}",
         robot_radius=robot.robot_radius,
@@ -207,12 +208,12 @@ def point_number(place):
 for number, (x, y) in enumerate(there.evaluation_points, start=1):
     print(f"point {number}: ({x:.1f}, {y:.1f}) m")
 for noise in (QUIET, VELOCITY[-1], RANGES[-1]):
-    (summary,), trace = traces["sqn", noise]
-    lost = np.flatnonzero(~np.asarray(summary.success))
+    batch = batches["sqn", noise]
+    lost = np.flatnonzero(~batch.main_metrics.success)
     pairs = Counter(
-        f"{point_number(trace.poses[0, e, :2])} to {point_number(trace.goals[e])}" for e in lost
+        f"{point_number(batch.starts[e, :2])} to {point_number(batch.goals[e])}" for e in lost
     )
-    nearest = trace.goal_distances[:, lost].min(axis=0)
+    nearest = batch.trajectory.info["goal_distance"][:, lost].min(axis=0)
     told = ", ".join(f"{pair}: {count}" for pair, count in pairs.most_common(5)) or "none"
     print(f"{level_name(noise)}: {len(lost)} of {EPISODES} failed; {told}", end="")
     print(f"; nearest to the goal, median {np.median(nearest):.1f} m" if len(lost) else "")

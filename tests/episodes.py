@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
+from sqn_jax.agent import QOutput, Trajectory
+from sqn_jax.env import Observation
 from sqn_jax.env.coverage import Lattice
 from sqn_jax.evaluation.recording import Episode
 from sqn_jax.maps import OccupancyMap
@@ -32,8 +35,56 @@ def covered_up_to(x: np.ndarray) -> np.ndarray:
     return np.bitwise_or.reduce(np.uint32(seen) << np.arange(32, dtype=np.uint32), axis=-1)
 
 
+def episode_of(values: dict[str, Any]) -> Episode:
+    """An `Episode` whose properties have these values.
+
+    The navigation part of the reward is made to fit `reachable`, which is read off it.
+    """
+    values = dict(values)
+    parts = np.array(values["reward_parts"], float)
+    parts[:, 0] = np.where(values["reachable"], np.abs(parts[:, 0]) + 1e-3, 0.0)
+    config = SimpleNamespace(
+        max_range=values["max_range"],
+        field_of_view_deg=math.degrees(values["field_of_view"]),
+        num_beams=values["ranges"].shape[1],
+        robot_radius=values["robot_radius"],
+    )
+    env_params = SimpleNamespace(
+        config=config,
+        goal_radius=values["goal_radius"],
+        time_step=values["time_step"],
+        lattice=values["lattice"],
+        reward_weights=np.ones(3),
+    )
+    names = ("reward_navigation", "reward_exploration", "reward_time")
+    info = dict(zip(names, parts.T, strict=True))
+    info |= {"goal_distance": values["goal_distances"], "collision": values["collisions"]}
+    output = (values[name] for name in ("q_values", "skill_weights", "skill_q_values"))
+    trajectory = Trajectory(
+        obs=Observation(ranges=values["ranges"] / values["max_range"], goal=cast(Any, None)),
+        actions=values["actions"],
+        rewards=parts.sum(axis=1),
+        poses=values["poses"],
+        goals=values["goal"],
+        info=info,
+        output=QOutput(*output),
+        covered=values["covered"],
+    )
+    return Episode(values["agent"], values["occupancy_map"], cast(Any, env_params), trajectory)
+
+
+def changed(one: Episode, **changes: Any) -> Episode:
+    """The same episode with other values of some properties."""
+    names = ("agent", "occupancy_map", "poses", "goal", "ranges", "actions", "reward_parts")
+    names += ("goal_distances", "reachable", "collisions", "skill_weights", "skill_q_values")
+    names += ("q_values", "field_of_view", "max_range", "goal_radius", "robot_radius")
+    names += ("time_step", "lattice")
+    values = {name: getattr(one, name) for name in names}
+    return episode_of(values | {"covered": one.trajectory.covered} | changes)
+
+
 def episode(length: int = 30, *, arrival: int = 12, skills: int = 2, **changes: Any) -> Episode:
-    """A drive of T = `length` steps of 0.1 s from (0.5, 0.6) m to the right, 0.1 m a step.
+    """An episode of T = `length` steps of 0.1 s from (0.5, 0.6) m to the right, 0.1 m a step.
 
     The goal radius is entered in step `arrival`; 0 for never. What is covered grows by 0.1 m a
     step from x = 1 m. Everything else is random, and may be changed.
@@ -54,12 +105,10 @@ def episode(length: int = 30, *, arrival: int = 12, skills: int = 2, **changes: 
         "ranges": rng.uniform(0.5, 4.5, size=(length + 1, 8)),
         "covered": covered_up_to(1.0 + 0.1 * steps),
         "actions": rng.integers(0, 5, length),
-        "rewards": parts.sum(axis=1),
         "reward_parts": parts,
         "goal_distances": distances,
         "reachable": distances < 1.0,
         "collisions": np.zeros(length, dtype=bool),
-        "covered_areas": np.zeros(length),
         "skill_weights": weights,
         "skill_q_values": skill_q_values,
         "q_values": (weights[..., None] * skill_q_values).sum(axis=1),
@@ -70,4 +119,4 @@ def episode(length: int = 30, *, arrival: int = 12, skills: int = 2, **changes: 
         "time_step": 0.1,
         "lattice": LATTICE,
     }
-    return Episode(**(values | changes))
+    return episode_of(values | changes)

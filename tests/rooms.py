@@ -14,7 +14,7 @@ from sqn_jax.agent.networks import QNetwork
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.training.rollout import start_fleet
+from sqn_jax.training.rollout import start_actors
 
 
 def small_room(length: int, **changes: Any) -> EnvParams:
@@ -49,7 +49,7 @@ def random_params(network: QNetwork, env_params: EnvParams, seed: int = 0) -> An
     """Weights large enough that greedy robots do different things."""
 
     def initial(key: jax.Array) -> Any:
-        obs = jax.tree.map(lambda x: x[None], start_fleet(key[None], network, env_params).obs)
+        obs = jax.tree.map(lambda x: x[None], start_actors(key[None], env_params, network).obs)
         return network.init(key, obs, initial_carry(network.config, 1))
 
     shapes = jax.eval_shape(initial, jax.random.key(0))

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.networks import Params, QNetwork, QOutput
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import LearnerConfig
 
 
@@ -36,7 +36,7 @@ class LossOutput:
 def r2d2_loss(
     params: Params,
     target_params: Params,
-    trajectory: Episodes,
+    trajectory: Trajectory,
     weights: Array,
     discount: Array | float,
     program: Program,
@@ -77,7 +77,7 @@ def r2d2_loss(
 
 
 def pqn_loss(
-    params: Params, trajectory: Episodes, discount: Array | float, program: Program
+    params: Params, trajectory: Trajectory, discount: Array | float, program: Program
 ) -> tuple[Array, LossOutput]:
     """Mean squared TD error against Q(lambda) targets from the network itself (PQN).
 
@@ -94,7 +94,7 @@ def pqn_loss(
 
 
 def _outputs_after_burn_in(
-    params: Params, trajectory: Episodes, burn_in_length: int, network: QNetwork
+    params: Params, trajectory: Trajectory, burn_in_length: int, network: QNetwork
 ) -> QOutput:
     """Outputs for the observations from `burn_in_length` on, warmed up on those before."""
     carry = trajectory.carry
@@ -107,7 +107,7 @@ def _outputs_after_burn_in(
 
 
 def _targets(
-    trajectory: Episodes,
+    trajectory: Trajectory,
     bootstrap: Array,
     discount: Array | float,
     returns: Callable[[Array, Array, Array], Array],

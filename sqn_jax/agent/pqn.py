@@ -8,21 +8,19 @@ network.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.learner import LearnerState, average_params, current_discount, gradient_step
 from sqn_jax.agent.loss import LossOutput, pqn_loss
 from sqn_jax.agent.networks import Params
 from sqn_jax.agent.program import Program
+from sqn_jax.agent.trajectory import Trajectory, over_robots
 
 
 def learn(
-    key: Array, state: LearnerState, trajectory: Episodes, program: Program
+    key: Array, state: LearnerState, trajectory: Trajectory, program: Program
 ) -> tuple[LearnerState, dict[str, Array]]:
     """Go through a window of all robots in minibatches, each robot equally often.
 
@@ -42,7 +40,7 @@ def learn(
 
 
 def update(
-    state: LearnerState, trajectory: Episodes, program: Program
+    state: LearnerState, trajectory: Trajectory, program: Program
 ) -> tuple[LearnerState, dict[str, Array]]:
     """Learn from one minibatch [T (+ 1), B, ...]."""
     discount = current_discount(state, program)
@@ -56,7 +54,7 @@ def update(
     return state, metrics
 
 
-def split_robots(trajectory: Episodes, num_batches: int) -> Episodes:
+def split_robots(trajectory: Trajectory, num_batches: int) -> Trajectory:
     """N robots to M minibatches: [T, N, ...] becomes [M, T, N / M, ...], [N, H] [M, N / M, H]."""
 
     def split(array: Array, axis: int) -> Array:
@@ -64,10 +62,4 @@ def split_robots(trajectory: Episodes, num_batches: int) -> Episodes:
         grouped = array.reshape(*shape[:axis], -1, num_batches, *shape[axis + 1 :])
         return jnp.moveaxis(grouped, axis + 1, 0)
 
-    return Episodes(
-        obs=jax.tree.map(partial(split, axis=1), trajectory.obs),
-        actions=split(trajectory.actions, 1),
-        rewards=split(trajectory.rewards, 1),
-        terminated=split(trajectory.terminated, 1),
-        carry=split(trajectory.carry, 0),
-    )
+    return over_robots(split, trajectory.for_learning())

@@ -16,13 +16,13 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent import replay
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.learner import LearnerState, current_discount, gradient_step, update_target
 from sqn_jax.agent.loss import LossOutput, r2d2_loss
 from sqn_jax.agent.networks import Params
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shards import all_shards
+from sqn_jax.agent.trajectory import Trajectory
 
 
 @struct.dataclass
@@ -39,7 +39,7 @@ class PackedEpisodes:
     """[N, T] bool."""
 
 
-def pack(trajectory: Episodes) -> PackedEpisodes:
+def pack(trajectory: Trajectory) -> PackedEpisodes:
     """Whole time-major episodes to compact items."""
     compact = PackedEpisodes(
         obs=dataclasses.replace(
@@ -54,10 +54,10 @@ def pack(trajectory: Episodes) -> PackedEpisodes:
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), compact)
 
 
-def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
+def unpack(items: PackedEpisodes, hidden_size: int) -> Trajectory:
     """The inverse of `pack`, to the rounding of the integers; the recurrent state is zero."""
     compact = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), items)
-    return Episodes(
+    return Trajectory(
         obs=dataclasses.replace(
             compact.obs,
             ranges=compact.obs.ranges.astype(jnp.float32) / 255,
@@ -70,13 +70,13 @@ def unpack(items: PackedEpisodes, hidden_size: int) -> Episodes:
     )
 
 
-def packed_item(trajectory: Episodes) -> Any:
+def packed_item(trajectory: Trajectory) -> Any:
     """Shapes and dtypes of one stored episode, from episodes given as shapes or arrays."""
     packed = jax.eval_shape(pack, trajectory)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
 
 
-def init_memory(trajectory: Episodes, program: Program) -> ReplayState:
+def init_memory(trajectory: Trajectory, program: Program) -> ReplayState:
     """An empty replay for rounds of N episodes [T (+ 1), N, ...], given as shapes or arrays."""
     return replay.init(
         packed_item(trajectory), program.config.replay.capacity, trajectory.actions.shape[1]
@@ -84,7 +84,7 @@ def init_memory(trajectory: Episodes, program: Program) -> ReplayState:
 
 
 def learn(
-    key: Array, state: LearnerState, trajectory: Episodes, program: Program
+    key: Array, state: LearnerState, trajectory: Trajectory, program: Program
 ) -> tuple[LearnerState, dict[str, Array]]:
     """Store a round of episodes and update, once enough are stored; the key is consumed.
 
@@ -129,7 +129,7 @@ def update(
 
 
 def learn_from(
-    state: LearnerState, trajectory: Episodes, weights: Array, program: Program
+    state: LearnerState, trajectory: Trajectory, weights: Array, program: Program
 ) -> tuple[LearnerState, Array, dict[str, Array]]:
     """One update from episodes that have been drawn.
 

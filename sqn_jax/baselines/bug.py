@@ -22,8 +22,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines.shortest_paths import wrap
 from sqn_jax.config import EnvConfig
+from sqn_jax.env.geometry import beam_angles, wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 
 FINENESS = 3
@@ -66,8 +66,7 @@ class BugNavigator:
     def __init__(self, config: EnvConfig, num_robots: int) -> None:
         """Start E episodes of a robot with this body, these beams and these actions."""
         self.config = config
-        half = math.radians(config.field_of_view_deg) / 2
-        self.beams = np.linspace(-half, half, config.num_beams)
+        self.beams = beam_angles(config)
         turn = config.turn_rate * config.time_step
         if turn <= 0 or config.forward_speed * config.time_step <= 0:
             raise ValueError("the robot cannot drive or turn, expected speeds above 0")
@@ -77,7 +76,7 @@ class BugNavigator:
         self._ahead = np.cos(apart).astype(np.float32)
         self._aside = np.sin(apart).astype(np.float32)
         # A direction between two beams, and straight behind, is judged by the nearest beam.
-        nearest = np.abs(wrap(apart)).min(axis=1)
+        nearest = np.abs(wrap_angle(apart)).min(axis=1)
         self._gap = np.sin(nearest + 1e-3).astype(np.float32)[:, None]
         self.robots = [_Robot(self) for _ in range(num_robots)]
 
@@ -237,7 +236,7 @@ class _Robot:
         """The direction nearest to the followed wall that is clear, counted away from it."""
         if self._was_here():
             return self._break_out(clear)
-        apart = wrap(self.bug.beams - self.wall)
+        apart = wrap_angle(self.bug.beams - self.wall)
         near = np.flatnonzero(np.abs(apart) <= WALL_WINDOW)
         if near.size:
             self.wall = float(self.bug.beams[near[readings[near].argmin()]])
@@ -275,10 +274,10 @@ class _Robot:
 
     def _towards(self, direction: float, clear: Floats) -> float:
         """The heading that can be driven nearest to a direction, the present one preferred."""
-        if abs(wrap(direction)) < STEADY * self.turn and clear[0] >= self.needed:
+        if abs(wrap_angle(direction)) < STEADY * self.turn and clear[0] >= self.needed:
             return 0.0
         headings = np.arange(0, self.count, FINENESS)
-        apart = np.abs(wrap(self.bug.directions[headings] - direction))
+        apart = np.abs(wrap_angle(self.bug.directions[headings] - direction))
         apart = apart + np.where(clear[headings] >= self.needed, 0.0, 2 * np.pi)
         return float(self.bug.directions[headings[apart.argmin()]])
 

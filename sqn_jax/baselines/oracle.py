@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sqn_jax.baselines.shortest_paths import Ways, wrap
+from sqn_jax.baselines.shortest_paths import Ways
 from sqn_jax.env import EnvParams
+from sqn_jax.env.geometry import wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 from sqn_jax.maps import OccupancyMap, traversable
 
@@ -184,7 +185,7 @@ class BeamSearch:
                 new[:, 1] += way * np.sin(new[:, 2])
             else:
                 sign = 1 if action == LEFT else -1
-                new[:, 2] = wrap(new[:, 2] + sign * self.turn)
+                new[:, 2] = wrap_angle(new[:, 2] + sign * self.turn)
                 turns = turns + sign
             parts.append((parent, np.full(len(parent), action), new, turns))
         parent, taken, new, turns = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -262,7 +263,7 @@ class BeamSearch:
 def _is_at(pose: Floats, planned: Floats) -> Any:
     """Whether poses [..., 3] are a planned one [3]."""
     away = pose - planned
-    away[..., 2] = wrap(away[..., 2])
+    away[..., 2] = wrap_angle(away[..., 2])
     return np.abs(away).max(axis=-1) < ON_PLAN
 
 

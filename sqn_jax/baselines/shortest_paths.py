@@ -12,11 +12,11 @@ therefore a reference to a few per cent, not a bound.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sqn_jax.env.geometry import wrap_angle
 from sqn_jax.maps.distance import clear_moves, goal_fields
 from sqn_jax.maps.occupancy import OccupancyMap, points_to_cells, traversable
 
@@ -208,7 +208,7 @@ class Ways:
             onward = onward[onward]
         ahead = np.where(sees_goal[:, None], to_goal, self.centres[onward] - self.centres)
         direction = np.arctan2(ahead[:, 1], ahead[:, 0])
-        bend = np.abs(wrap(direction[onward] - direction))
+        bend = np.abs(wrap_angle(direction[onward] - direction))
         bends = np.maximum(bend - BEND_SLACK, 0.0) / self.turn
         while True:
             # Each round doubles the part of the way that is summed up.
@@ -229,11 +229,6 @@ class Ways:
         length = self.length[field, cell] - (
             away[:, 0] * np.cos(direction) + away[:, 1] * np.sin(direction)
         )
-        off = np.abs(wrap(pose[:, 2] - direction)) / self.turn
+        off = np.abs(wrap_angle(pose[:, 2] - direction)) / self.turn
         in_reverse = np.pi / self.turn - off + np.maximum(length, 0) * (1 / backward - 1 / forward)
         return length / forward + np.minimum(off, in_reverse) + self.bends[field, cell]
-
-
-def wrap(angle: Any) -> Any:
-    """An angle in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any, TypeVar
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from numpy.typing import NDArray
+
+from sqn_jax.config import EnvConfig
+
+Angle = TypeVar("Angle", float, Array, NDArray[Any])
+"""rad, a number or an array of JAX or of NumPy."""
 
 
-def wrap_angle(angle: Array) -> Array:
+def wrap_angle(angle: Angle) -> Angle:
     """Return the angle folded into [-pi, pi), rad, of any shape."""
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def beam_angles(config: EnvConfig) -> NDArray[np.float64]:
+    """[R] directions of the beams from the heading, rad, from the rightmost to the leftmost."""
+    half = math.radians(config.field_of_view_deg) / 2
+    return np.linspace(-half, half, config.num_beams)
 
 
 def goal_in_robot_frame(pose: Array, goal: Array) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from jax import Array
 
 from sqn_jax.env import coverage, reward
 from sqn_jax.env.dynamics import move
-from sqn_jax.env.geometry import goal_in_robot_frame
+from sqn_jax.env.geometry import beam_angles, goal_in_robot_frame
 from sqn_jax.env.params import EnvParams, EnvState, Observation
 from sqn_jax.env.raycast import cast_fan
 
@@ -159,12 +159,10 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
 
 def true_ranges(pose: Array, params: EnvParams) -> Array:
     """Noise-free readings [R] of all beams, m, from the rightmost to the leftmost."""
-    half = field_of_view(params) / 2
-    beams = np.linspace(-half, half, params.config.num_beams, dtype=np.float32)
     return cast_fan(
         params.sight,
         pose,
-        beams,
+        beam_angles(params.config).astype(np.float32),
         max_range=params.config.max_range,
         iterations=params.config.ray_iterations,
     )
@@ -173,6 +171,17 @@ def true_ranges(pose: Array, params: EnvParams) -> Array:
 def field_of_view(params: EnvParams) -> float:
     """Angle from the first beam to the last, rad."""
     return math.radians(params.config.field_of_view_deg)
+
+
+def covered_along(poses: Array, params: EnvParams) -> Array:
+    """The points seen so far at each of the poses [T + 1, 3] of an episode, as in `EnvState`."""
+
+    def look(covered: Array, pose: Array) -> tuple[Array, Array]:
+        covered, _ = _add_scan(covered, pose, true_ranges(pose, params), params)
+        return covered, covered
+
+    _, covered = jax.lax.scan(look, coverage.empty(params.lattice), poses)
+    return covered
 
 
 def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> tuple[Array, Array]:

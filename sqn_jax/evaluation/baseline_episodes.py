@@ -1,13 +1,14 @@
-"""Episodes of navigators that are no networks: the oracle and the wall follower.
+"""Episodes of baselines, which are no networks: the oracle and the wall follower.
 
-Both meet the starts, goals and noise that `episodes.run_episodes` gives to a network for the same
-key.
+They choose their actions on the host. Starts, goals and noise are those that
+`episodes.run_episodes` gives to a network for the same keys, a step is that of the rollout, and
+what is recorded is the same `Trajectory`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,93 +16,94 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from sqn_jax.agent.networks import QOutput
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.baselines.bug import BugNavigator
 from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
-from sqn_jax.evaluation.episodes import episode_keys, start_by_hand, step_by_hand
+from sqn_jax.evaluation.episodes import metrics_of, start_by_hand, step_by_hand
 from sqn_jax.maps import OccupancyMap
-from sqn_jax.training.rollout import EpisodeSummary, Trace, summarize
+from sqn_jax.training.rollout import EpisodeMetrics, with_ends
 
 Ints = NDArray[np.int64]
 Choose = Callable[[Observation, EnvState], Ints]
+"""Actions [E] from the observations and states of all robots; called once a step."""
 
 
-def run_oracle(
-    key: Array, occupancy_map: OccupancyMap, env_params: EnvParams, num_episodes: int
-) -> tuple[EpisodeSummary, Trace]:
-    """Drive episodes with the navigator that knows the map.
+def oracle(occupancy_map: OccupancyMap, env_params: EnvParams) -> Choose:
+    """The choice of a navigator that knows the map, for the episodes of one run.
 
     Args:
-        key: the key of `episodes.episode_keys`: the same one gives the same tasks and noise.
         occupancy_map: the map `env_params` was made from.
         env_params: the world.
-        num_episodes: E.
 
     Returns:
-        One number an episode [E], and the traces; skill arrays have width 1 and say nothing.
-
-    Raises:
-        ValueError: the map is not the one of `env_params`, or the robot cannot drive or turn.
+        The choice; it raises ValueError if the map is not the one of `env_params`, or the robot
+        cannot drive or turn.
     """
-    oracle: Oracle | None = None
+    navigator: Oracle | None = None
 
     def choose(_: Observation, state: EnvState) -> Ints:
-        nonlocal oracle
+        nonlocal navigator
         poses, goals = np.asarray(state.pose, np.float64), np.asarray(state.goal, np.float64)
-        if oracle is None:
-            oracle = Oracle(occupancy_map, env_params, goals)
-        return oracle.choose(poses)
+        if navigator is None:
+            navigator = Oracle(occupancy_map, env_params, goals)
+        return navigator.choose(poses)
 
-    return drive(episode_keys(key, num_episodes), env_params, choose)
+    return choose
 
 
-def run_bug(key: Array, env_params: EnvParams, num_episodes: int) -> tuple[EpisodeSummary, Trace]:
-    """Drive episodes with the wall follower, which sees the observation and nothing else.
-
-    Args:
-        key, env_params, num_episodes: see `run_oracle`.
-
-    Returns:
-        One number an episode [E], and the traces.
-    """
-    bug = BugNavigator(env_params.config, num_episodes)
+def bug(env_params: EnvParams, num_episodes: int) -> Choose:
+    """The choice of the wall follower, which sees the observation and nothing else."""
+    navigator = BugNavigator(env_params.config, num_episodes)
 
     def choose(obs: Observation, _: EnvState) -> Ints:
-        return bug.choose(np.asarray(obs.ranges, np.float64), np.asarray(obs.goal, np.float64))
+        ranges, goal = np.asarray(obs.ranges, np.float64), np.asarray(obs.goal, np.float64)
+        return navigator.choose(ranges, goal)
 
-    return drive(episode_keys(key, num_episodes), env_params, choose)
+    return choose
 
 
-def drive(keys: Array, env_params: EnvParams, choose: Choose) -> tuple[EpisodeSummary, Trace]:
-    """Drive whole episodes with actions chosen on the host.
+def run_baseline(
+    keys: Array,
+    choose: Choose,
+    env_params: EnvParams,
+    *,
+    goal_radii: Sequence[float] = (),
+    fields: Sequence[str] = ("poses", "goals"),
+) -> tuple[list[EpisodeMetrics], Trajectory]:
+    """Run whole episodes with actions chosen on the host.
 
     Args:
-        keys: [E], from `episode_keys`.
+        keys: [E] from `episodes.episode_keys`: the same ones give the same tasks and noise.
+        choose: who acts; a fresh one for each run.
         env_params: the world.
-        choose: actions [E] from the observations and states of all robots; called once a step.
+        goal_radii: m, what counts as reaching the goal; by default only `env_params.goal_radius`.
+        fields: of `Trajectory`, those to return.
 
     Returns:
-        One number an episode [E], and the traces, as NumPy arrays.
+        For each radius one number an episode [E], and the fields of all episodes; NumPy arrays.
+        In `output` a single skill of weight 1 says nothing, nor do its values.
     """
-    step_keys, obs, state = start_by_hand(keys, env_params)
-    poses, goals = [np.asarray(state.pose)], np.asarray(state.goal)
-    steps: list[Any] = []
-    for step_key in step_keys:
-        actions = jnp.asarray(choose(obs, state), jnp.int32)
-        obs, state, reward, _, _, info = step_by_hand(step_key, state, actions, env_params)
-        names = ("goal_distance", "collision", "covered_area")
-        steps.append(jax.device_get((reward, *(info[name] for name in names))))
-        poses.append(np.asarray(state.pose))
-    rewards, distances, collisions, areas = (np.stack(parts) for parts in zip(*steps, strict=True))
-    recorded: dict[str, Any] = {
-        "poses": np.stack(poses),
-        "goals": goals,
-        "rewards": rewards,
-        "goal_distances": distances,
-        "collisions": collisions,
-        "covered_areas": areas,
-        "skill_weights": np.ones((*rewards.shape, 1), np.float32),
-        "skill_q_values": np.zeros((*rewards.shape, 1, NUM_ACTIONS), np.float32),
-    }
-    trace = Trace(**recorded)
-    return jax.device_get(summarize(trace, env_params.goal_radius)), trace
+    step_keys, first = start_by_hand(keys, env_params)
+    # Observations of many episodes take much memory, and are mostly not wanted.
+    wanted = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
+    actors, steps = first, []
+    for keys_of_step in step_keys:
+        actions = jnp.asarray(choose(actors.obs, actors.env_state), jnp.int32)
+        actors, step = step_by_hand(keys_of_step, actors, actions, env_params)
+        steps.append(jax.device_get(step.only(*wanted)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *steps)
+    trajectory = with_ends(stacked, first, actors)
+    trajectory = dataclasses.replace(trajectory, output=_one_skill(stacked))
+    radii = goal_radii or [float(env_params.goal_radius)]
+    return metrics_of(trajectory, radii), jax.device_get(trajectory.only(*fields))
+
+
+def _one_skill(steps: Trajectory) -> QOutput:
+    shape = steps.rewards.shape
+    return QOutput(
+        q_values=jnp.zeros((*shape, NUM_ACTIONS)),
+        skill_weights=jnp.ones((*shape, 1)),
+        skill_q_values=jnp.zeros((*shape, 1, NUM_ACTIONS)),
+    )

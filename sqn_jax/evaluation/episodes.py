@@ -1,12 +1,12 @@
 """Greedy episodes of a trained policy, without exploration and without auto-reset.
 
-Episodes are driven in lanes, `LANES` at a time whatever is asked for: an episode then comes out
-the same bit for bit whether it is driven alone or beside others.
+Episodes are run `BATCH` at a time whatever is asked for, by the same compiled program whatever of
+them is wanted: an episode then comes out the same bit for bit whether it is run alone or beside
+others, for its score or for its picture.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -15,23 +15,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
 
-from sqn_jax.agent.networks import Params, QNetwork, make_network
-from sqn_jax.config import Algorithm, NetworkConfig
-from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation, navigation
+from sqn_jax.agent.networks import Params, QNetwork, initial_carry
+from sqn_jax.agent.trajectory import Trajectory, over_robots
+from sqn_jax.env import EnvParams
 from sqn_jax.training.rollout import (
-    EpisodeSummary,
-    Fleet,
-    Trace,
-    draw_chance,
-    noise_keys,
-    start_fleet,
-    summarize,
+    ActorState,
+    EpisodeMetrics,
+    RandomDraws,
+    episode_metrics,
+    random_draws,
+    reset_robots,
+    step_actors,
     unroll,
 )
 
-LANES = 100
-"""Episodes that are driven side by side."""
+BATCH = 100
+"""Episodes that are run side by side."""
 
 
 def episode_keys(key: Array, num_episodes: int) -> Array:
@@ -39,121 +40,113 @@ def episode_keys(key: Array, num_episodes: int) -> Array:
     return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_episodes))
 
 
-def start_episode(key: Array, network: QNetwork, env_params: EnvParams) -> tuple[Array, Fleet]:
-    """Start, goal and first observation of the episode of a key, as a fleet of one robot.
+def start_episodes(
+    keys: Array, carry: Array, env_params: EnvParams
+) -> tuple[RandomDraws, ActorState]:
+    """Start, goal and first observation of the episodes of keys [E], and their randomness [T, E].
 
-    Returns:
-        The key to drive it with, and the robot.
+    All follow from an episode's own key: every policy that is given the same keys and the same
+    world meets the same tasks and the same noise.
+
+    Args:
+        keys: [E] from `episode_keys`.
+        carry: [E, H] what the robots begin with.
+        env_params: the world.
     """
-    start_key, drive_key = jax.random.split(key)
-    return drive_key, start_fleet(jax.random.split(start_key, 1), network, env_params)
+
+    def split(key: Array) -> tuple[Array, RandomDraws]:
+        start_key, draws_key = jax.random.split(key)
+        draws = random_draws(draws_key, env_params.max_steps, 1)
+        return jax.random.split(start_key, 1)[0], jax.tree.map(lambda x: x[:, 0], draws)
+
+    start_keys, draws = jax.vmap(split, out_axes=(0, 1))(keys)
+    return draws, ActorState(*reset_robots(start_keys, env_params), carry)
 
 
 def run_episodes(
     keys: Array,
     params: Params,
     env_params: EnvParams,
+    network: QNetwork,
     *,
-    algo: Algorithm,
-    network_config: NetworkConfig,
     goal_radii: Sequence[float] = (),
-    on_batch: Callable[[int], object] | None = None,
-) -> tuple[list[EpisodeSummary], Trace]:
-    """Drive greedy episodes of one policy.
-
-    Starts, goals and noise come from the keys alone: every policy that is given the same keys and
-    the same world meets the same tasks.
+    fields: Sequence[str] = ("poses", "goals"),
+    on_batch: Callable[[int], object] = lambda count: None,
+) -> tuple[list[EpisodeMetrics], Trajectory]:
+    """Run greedy episodes of one policy.
 
     Args:
         keys: [E] from `episode_keys`; independent of any training key.
         params: parameters of one network, without a seed axis.
         env_params: the world, with the noise it was made with.
-        algo: which network the parameters belong to.
-        network_config: its sizes.
+        network: the one the parameters belong to.
         goal_radii: m, what counts as reaching the goal; by default only `env_params.goal_radius`.
+        fields: of `Trajectory`, those to bring to the host; a step of all of them takes about
+            0.4 kB.
         on_batch: called after each batch with the number of episodes it held.
 
     Returns:
-        For each radius one number an episode [E], and the traces of all episodes; NumPy arrays.
+        For each radius one number an episode [E], and the fields of all episodes; NumPy arrays.
     """
-    radii = jnp.asarray(goal_radii or [env_params.goal_radius], jnp.float32)
-    batches = []
-    for first in range(0, len(keys), LANES):
-        batch = keys[first : first + LANES]
-        lanes = batch[jnp.arange(LANES) % len(batch)]
-        driven = _drive(lanes, params, env_params, radii, algo=algo, network_config=network_config)
-        batches.append(_episodes(jax.device_get(driven), slice(len(batch))))
-        if on_batch is not None:
-            on_batch(len(batch))
-    summary, trace = jax.tree.map(
-        lambda axis, *parts: np.concatenate(parts, axis), _EPISODE_AXES, *batches
-    )
-    return [jax.tree.map(lambda x, i=i: x[i], summary) for i in range(len(radii))], trace
+    radii = goal_radii or [float(env_params.goal_radius)]
+    metrics: list[list[EpisodeMetrics]] = []
+    trajectories: list[Trajectory] = []
+    for first in range(0, len(keys), BATCH):
+        batch = keys[first : first + BATCH]
+        full = batch[jnp.arange(BATCH) % len(batch)]
+        own = slice(len(batch))
+        trajectory = _run_batch(full, params, env_params, network)
+        metrics.append(jax.tree.map(lambda x, own=own: x[own], metrics_of(trajectory, radii)))
+        trajectories.append(jax.device_get(trajectory.only(*fields)).of_robots(own))
+        on_batch(len(batch))
+
+    def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+        return np.concatenate(parts, axis)
+
+    joined: list[EpisodeMetrics] = jax.tree.map(join, *metrics)
+    return joined, over_robots(join, *trajectories)
 
 
-def _axes(kind: Any, but: str = "") -> Any:
-    """1 in every field of a struct, 0 in the one named."""
-    return kind(**{field.name: int(field.name != but) for field in dataclasses.fields(kind)})
+@partial(jax.jit, static_argnames="network")
+def _run_batch(keys: Array, params: Params, env_params: EnvParams, network: QNetwork) -> Trajectory:
+    carry = initial_carry(network.config, len(keys))
+    draws, actors = start_episodes(keys, carry, env_params)
+    _, trajectory = unroll(draws, params, actors, jnp.zeros(len(keys)), env_params, network)
+    return trajectory
 
 
-_EPISODE_AXES = (_axes(EpisodeSummary), _axes(Trace, but="goals"))
-"""Where the axis of episodes stands: summaries are [radii, E], traces [T, E, ...], goals [E]."""
+def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
+    """`episode_metrics` for each radius, m; NumPy arrays [E].
+
+    In a program of their own: whatever the radii, the episodes come from the same one.
+    """
+    needed = trajectory.only("rewards", "poses", "info")
+    metrics = [_metrics(needed, jnp.float32(radius)) for radius in goal_radii]
+    on_host: list[EpisodeMetrics] = jax.device_get(metrics)
+    return on_host
 
 
-@partial(jax.jit, static_argnames=("algo", "network_config"))
-def _drive(
-    keys: Array,
-    params: Params,
-    env_params: EnvParams,
-    goal_radii: Array,
-    *,
-    algo: Algorithm,
-    network_config: NetworkConfig,
-) -> tuple[EpisodeSummary, Trace]:
-    """One batch."""
-    network = make_network(algo, network_config, NUM_ACTIONS)
-
-    def one(key: Array) -> tuple[EpisodeSummary, Trace]:
-        drive_key, fleet = start_episode(key, network, env_params)
-        greedy = jnp.zeros(1)
-        chance = draw_chance(drive_key, env_params.max_steps, 1)
-        trace = unroll(chance, network, params, fleet, greedy, env_params)[2]
-        summaries = jax.vmap(partial(summarize, trace))(goal_radii)
-        return _episodes((summaries, trace), 0)
-
-    return jax.vmap(one, out_axes=_EPISODE_AXES)(keys)
-
-
-def _episodes(batch: tuple[EpisodeSummary, Trace], chosen: Any) -> tuple[EpisodeSummary, Trace]:
-    """The chosen ones of a batch."""
-    return jax.tree.map(lambda axis, x: x[(slice(None),) * axis + (chosen,)], _EPISODE_AXES, batch)
+_metrics = jax.jit(episode_metrics)
 
 
 @jax.jit
-def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, Observation, EnvState]:
-    """Start the episodes of `run_episodes`, for a navigator that is no network.
+def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, ActorState]:
+    """Start the episodes of `run_episodes`, for an agent that is no network.
 
     Args:
         keys: [E] from `episode_keys`.
         env_params: the world.
 
     Returns:
-        The keys [T, E] for `step_by_hand`, first observations and states [E, ...].
+        The keys [T, E] for `step_by_hand`, and the robots, whose carry is empty [E, 0].
     """
-
-    def one(key: Array) -> tuple[Array, Observation, EnvState]:
-        start_key, drive_key = jax.random.split(key)
-        start = navigation.reset(jax.random.split(start_key, 1)[0], env_params)
-        noise_key = jax.random.split(drive_key)[1]
-        return noise_keys(noise_key, env_params.max_steps, 1)[:, 0], *start
-
-    return jax.vmap(one, out_axes=(1, 0, 0))(keys)
+    draws, actors = start_episodes(keys, jnp.zeros((len(keys), 0)), env_params)
+    return draws.step_keys, actors
 
 
 @jax.jit
 def step_by_hand(
-    keys: Array, state: EnvState, actions: Array, env_params: EnvParams
-) -> tuple[Observation, EnvState, Array, Array, Array, navigation.Info]:
-    """Advance all robots by actions [E] chosen outside, with the noise of `run_episodes`."""
-    step = jax.vmap(navigation.step, in_axes=(0, 0, 0, None))
-    return step(keys, state, actions, env_params)
+    step_keys: Array, actors: ActorState, actions: Array, env_params: EnvParams
+) -> tuple[ActorState, Trajectory]:
+    """`rollout.step_actors`: advance all robots by actions [E] chosen outside."""
+    return step_actors(step_keys, actors, actions, env_params)

@@ -1,121 +1,49 @@
-"""Episodes with everything that happened in them, for pictures: the states of the simulator itself.
+"""Episodes for pictures: a view of the very episodes that an evaluation has.
 
-`episodes.run_episodes` keeps what statistics need. Here a few episodes are kept whole: the covered
-area, the readings and the parts of the reward are those that the step function produced, none is
-worked out again. `record` goes from a policy and the name of a map to such episodes on the host.
+`record` goes from a policy and the name of a map to such episodes on the host. They come from
+`episodes.run_episodes`, that is from the compiled program of the evaluation. The points covered on
+the way are the only thing it does not put out, since they take up to several kB a step: the
+simulator's own functions count them again along the poses.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import cached_property
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 from numpy.typing import NDArray
 
-from sqn_jax.agent.networks import Params, QOutput, make_network
-from sqn_jax.config import Algorithm, NetworkConfig
-from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
+from sqn_jax.agent.trajectory import Trajectory
+from sqn_jax.env import EnvParams
 from sqn_jax.env.coverage import Lattice
-from sqn_jax.env.navigation import Info
-from sqn_jax.evaluation.compare import (
+from sqn_jax.env.geometry import beam_angles, wrap_angle
+from sqn_jax.env.navigation import covered_along
+from sqn_jax.evaluation.agents import Learnt
+from sqn_jax.evaluation.compare import load_maps
+from sqn_jax.evaluation.episodes import episode_keys, run_episodes
+from sqn_jax.evaluation.settings import (
     SPAWN_MODES,
-    Learnt,
     Settings,
     Tasks,
     World,
-    load_maps,
     robot_for,
     task_key,
     worlds,
 )
-from sqn_jax.evaluation.episodes import episode_keys, start_episode
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy
-from sqn_jax.training.rollout import Chance, Fleet, act_and_step, draw_chance
 
 Floats = NDArray[np.floating]
 
-
-@struct.dataclass
-class Recording:
-    """E episodes of T steps. Index t of `states` and `observations` is before step t."""
-
-    states: EnvState
-    """[E, T + 1, ...] poses, goals, covered points."""
-    observations: Observation
-    """[E, T + 1, ...] what the agent saw, in 0..1 and with noise where there is any."""
-    actions: Array
-    """[E, T] int32."""
-    rewards: Array
-    """[E, T]."""
-    info: Info
-    """[E, T] each: what `navigation.step` says of a step, the parts of the reward among it."""
-    outputs: QOutput
-    """[E, T, ...] action values, skill decision, action values of each skill."""
-
-    def episode(self, index: int) -> Recording:
-        """One of them: the same arrays without the first axis."""
-        chosen: Recording = jax.tree.map(lambda x: x[index], self)
-        return chosen
-
-
-@partial(jax.jit, static_argnames=("algo", "network_config"))
-def record_episodes(
-    keys: Array,
-    params: Params,
-    env_params: EnvParams,
-    *,
-    algo: Algorithm,
-    network_config: NetworkConfig,
-) -> Recording:
-    """Drive greedy episodes and keep all of them.
-
-    Tasks and noise are those that `episodes.run_episodes` has for the same keys. How an episode
-    goes on may differ from there, since sums are rounded in another order.
-
-    Args:
-        keys: [E] from `episodes.episode_keys`.
-        params: parameters of one network, without a seed axis.
-        env_params: the world, with the noise it was made with.
-        algo: which network the parameters belong to.
-        network_config: its sizes.
-
-    Returns:
-        The episodes; a step takes about 1 kB on the maze and 6 kB in the cave.
-    """
-    network = make_network(algo, network_config, NUM_ACTIONS)
-    advance = partial(
-        act_and_step,
-        network=network,
-        params=params,
-        epsilon=jnp.zeros(1),
-        env_params=env_params,
-    )
-
-    def one(key: Array) -> Recording:
-        drive_key, fleet = start_episode(key, network, env_params)
-        chance = draw_chance(drive_key, env_params.max_steps, 1)
-
-        def body(fleet: Fleet, chance: Chance) -> tuple[Fleet, Any]:
-            after, (_, _, action, (reward, _, info), output) = advance(fleet, chance)
-            return after, ((after.state, after.obs), action, reward, info, output)
-
-        _, (seen, *steps) = jax.lax.scan(body, fleet, chance)
-        states, observations = jax.tree.map(
-            lambda first, later: jnp.concatenate([first[None], later])[:, 0],
-            (fleet.state, fleet.obs),
-            seen,
-        )
-        return Recording(states, observations, *jax.tree.map(lambda x: x[:, 0], steps))
-
-    return jax.vmap(one)(keys)
+RECORDED = tuple(
+    field.name for field in dataclasses.fields(Trajectory) if field.name not in ("carry", "covered")
+)
+"""The fields of a trajectory that an `Episode` is made from; `covered` is added to them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,53 +54,120 @@ class Episode:
     """
 
     agent: str
-    """Who drove."""
+    """Who acted."""
     occupancy_map: OccupancyMap
-    poses: Floats
-    """[T + 1, 3] x m, y m, heading rad."""
-    goal: Floats
-    """[2] x m, y m."""
-    ranges: Floats
-    """[T + 1, R] m, what the agent saw, with noise where there is any; from the rightmost beam."""
-    covered: NDArray[np.uint32]
-    """[T + 1, ...] the points seen so far, a bit each; see `covered_points`."""
-    actions: NDArray[np.integer]
-    """[T] in 0..4, see `env.ACTION_NAMES`."""
-    rewards: Floats
-    """[T]."""
-    reward_parts: Floats
-    """[T, 3] navigation, exploration and time, weighted: their sum is the reward."""
-    goal_distances: Floats
-    """[T] m, in a straight line, after each step."""
-    reachable: NDArray[np.bool_]
-    """[T] whether the goal was in view and not hidden after each step (paper eq. 8)."""
-    collisions: NDArray[np.bool_]
-    """[T] the move was refused."""
-    covered_areas: Floats
-    """[T] m2 newly seen."""
-    skill_weights: Floats
-    """[T, K] the skill decision."""
-    skill_q_values: Floats
-    """[T, K, A] action values of each skill."""
-    q_values: Floats
-    """[T, A] their weighted sum, by which the action was chosen."""
-    field_of_view: float
-    """Angle from the first beam to the last, rad."""
-    max_range: float
-    """m."""
-    goal_radius: float
-    """m."""
-    robot_radius: float
-    """m."""
-    time_step: float
-    """s."""
-    lattice: Lattice
-    """Where the points of `covered` lie."""
+    env_params: EnvParams
+    """The world that was made from the map."""
+    trajectory: Trajectory
+    """What happened, [T, ...] or [T + 1, ...], without an axis of robots."""
+
+    @property
+    def poses(self) -> Floats:
+        """[T + 1, 3] x m, y m, heading rad."""
+        poses: Floats = self.trajectory.poses
+        return poses
+
+    @property
+    def goal(self) -> Floats:
+        """[2] x m, y m."""
+        goal: Floats = self.trajectory.goals
+        return goal
+
+    @cached_property
+    def ranges(self) -> Floats:
+        """[T + 1, R] m, what the agent saw, with noise where there is any."""
+        ranges: Floats = self.trajectory.obs.ranges * self.max_range
+        return ranges
+
+    @property
+    def actions(self) -> NDArray[np.integer]:
+        """[T] in 0..4, see `env.ACTION_NAMES`."""
+        actions: NDArray[np.integer] = self.trajectory.actions
+        return actions
+
+    @property
+    def rewards(self) -> Floats:
+        """[T]."""
+        rewards: Floats = self.trajectory.rewards
+        return rewards
+
+    @cached_property
+    def reward_parts(self) -> Floats:
+        """[T, 3] navigation, exploration and time, weighted: their sum is the reward."""
+        names = ("reward_navigation", "reward_exploration", "reward_time")
+        parts = np.stack([self.trajectory.info[name] for name in names], axis=-1)
+        return parts * np.asarray(self.env_params.reward_weights)
+
+    @property
+    def goal_distances(self) -> Floats:
+        """[T] m, in a straight line, after each step."""
+        distances: Floats = self.trajectory.info["goal_distance"]
+        return distances
+
+    @property
+    def reachable(self) -> NDArray[np.bool_]:
+        """[T] whether the goal was in view and not hidden after each step (paper eq. 8)."""
+        reachable: NDArray[np.bool_] = self.trajectory.info["reward_navigation"] > 0
+        return reachable
+
+    @property
+    def collisions(self) -> NDArray[np.bool_]:
+        """[T] the move was refused."""
+        collisions: NDArray[np.bool_] = self.trajectory.info["collision"]
+        return collisions
+
+    @property
+    def skill_weights(self) -> Floats:
+        """[T, K] the skill decision."""
+        weights: Floats = self.trajectory.output.skill_weights
+        return weights
+
+    @property
+    def skill_q_values(self) -> Floats:
+        """[T, K, A] action values of each skill."""
+        values: Floats = self.trajectory.output.skill_q_values
+        return values
+
+    @property
+    def q_values(self) -> Floats:
+        """[T, A] their weighted sum, by which the action was chosen."""
+        values: Floats = self.trajectory.output.q_values
+        return values
+
+    @property
+    def max_range(self) -> float:
+        """m."""
+        return self.env_params.config.max_range
+
+    @property
+    def field_of_view(self) -> float:
+        """Angle from the first beam to the last, rad."""
+        return math.radians(self.env_params.config.field_of_view_deg)
+
+    @cached_property
+    def goal_radius(self) -> float:
+        """m."""
+        return float(self.env_params.goal_radius)
+
+    @property
+    def robot_radius(self) -> float:
+        """m."""
+        return self.env_params.config.robot_radius
+
+    @cached_property
+    def time_step(self) -> float:
+        """s."""
+        return float(self.env_params.time_step)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Where the points lie that were covered."""
+        return self.env_params.lattice
 
     @property
     def num_steps(self) -> int:
         """T."""
-        return len(self.actions)
+        return len(self.rewards)
 
     @property
     def success(self) -> bool:
@@ -185,10 +180,18 @@ class Episode:
         inside = self.goal_distances < self.goal_radius
         return int(inside.argmax()) + 1 if inside.any() else self.num_steps
 
+    def first_steps(self, count: int) -> Episode:
+        """The beginning of the episode, at most all of it."""
+        return dataclasses.replace(self, trajectory=self.trajectory.first_steps(count))
+
+    def goal_headings(self) -> Floats:
+        """[T + 1] rad in [-pi, pi), direction of the goal from the robot's heading."""
+        x, y, heading = self.poses.T
+        return wrap_angle(np.arctan2(self.goal[1] - y, self.goal[0] - x) - heading)
+
     def beam_angles(self) -> Floats:
         """[R] directions of the beams from the heading, rad, from the rightmost to the leftmost."""
-        half = self.field_of_view / 2
-        return np.linspace(-half, half, self.ranges.shape[1])
+        return beam_angles(self.env_params.config)
 
     def beam_ends(self, index: int) -> Floats:
         """[R, 2] m, where the beams end on the map before step `index` (0..T)."""
@@ -197,9 +200,14 @@ class Episode:
         reach = self.ranges[index]
         return np.stack([x + reach * np.cos(angles), y + reach * np.sin(angles)], axis=-1)
 
+    def covered_bits(self, index: int) -> NDArray[np.bool_]:
+        """[..., 32] whether each point of the lattice was seen before step `index` (0..T)."""
+        covered = self.trajectory.covered[index]
+        return (covered[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
+
     def covered_points(self, index: int) -> Floats:
         """[P, 2] m, the points seen before step `index` (0..T), each for `lattice.cell` squared."""
-        return self.lattice.points()[covered_bits(self.covered[index])]
+        return self.lattice.points()[self.covered_bits(index)]
 
     def covered_mask(self, index: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """The seen area as an image over the whole map, before step `index` (0..T).
@@ -215,13 +223,8 @@ class Episode:
         x = (np.arange(shape[1]) + 0.5) * width / shape[1]
         y = (np.arange(shape[0]) + 0.5) * height / shape[0]
         place = self.lattice.nearest_point(*np.meshgrid(x, y))
-        mask: NDArray[np.bool_] = covered_bits(self.covered[index])[place]
+        mask: NDArray[np.bool_] = self.covered_bits(index)[place]
         return mask
-
-
-def covered_bits(covered: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """A `covered` array [words, groups, rows] with an axis more: [..., 32], a truth a point."""
-    return (covered[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
 
 
 def record(
@@ -235,10 +238,10 @@ def record(
     max_steps: int = 0,
     index: int = 0,
 ) -> list[Episode]:
-    """Drive a policy greedily and keep everything: the first episodes of `sqn evaluate`'s.
+    """Run a policy greedily and keep everything: the first episodes of `sqn evaluate`'s.
 
     Args:
-        policy: who drives.
+        policy: who acts.
         map_name: a map of the project, or a file.
         tasks: from the evaluation points or between random pairs of spawn points.
         episodes: how many.
@@ -258,58 +261,35 @@ def record(
     agent = Learnt(policy.config.algo, (policy,))
     maps = load_maps([agent], settings)
     (world,) = worlds(robot_for(agent.env_config, settings), maps, settings)
-    return record_world(policy, world, episodes=episodes, seed=seed, index=index)
+    keys = episode_keys(task_key(seed, tasks), episodes)
+    return record_episodes(keys, agent, policy.training_seeds[index], world)
 
 
-def record_world(
-    policy: Policy, world: World, *, episodes: int, seed: int = 1_000, index: int = 0
+def record_episodes(
+    keys: Array, agent: Learnt, training_seed: int | None, world: World
 ) -> list[Episode]:
-    """The same in a world that is there already."""
-    keys = episode_keys(task_key(seed, world.tasks), episodes)
-    config = policy.config
-    recording = record_episodes(
-        keys,
-        policy.params[index],
-        world.env_params,
-        algo=config.algo,
-        network_config=config.network,
-    )
-    return on_host(recording, world, agent=config.algo)
+    """Run a policy greedily in a world that is there already, and keep everything.
 
+    Args:
+        keys: [E] from `episode_keys`, of which an evaluation seed has the first ones.
+        agent: who acts.
+        training_seed: with the parameters of which seed.
+        world: where.
 
-def on_host(recording: Recording, world: World, *, agent: str) -> list[Episode]:
-    """The episodes of a recording one by one, as NumPy arrays."""
-    params = world.env_params
-    config = params.config
-    weights = np.asarray(params.reward_weights)
-    told: Any = jax.device_get(recording)
-    info = told.info
-    parts = ("reward_navigation", "reward_exploration", "reward_time")
-    reward_parts = np.stack([info[name] for name in parts], axis=-1) * weights
+    Returns:
+        The episodes; a step takes about 0.5 kB, and its covered points up to several kB more.
+    """
+    params, env_params = agent.params(training_seed), world.env_params
+    _, recorded = run_episodes(keys, params, env_params, agent.network, fields=RECORDED)
+    covered = jax.device_get(_covered(recorded.poses, env_params))
+    recorded = dataclasses.replace(recorded, covered=covered)
     return [
-        Episode(
-            agent=agent,
-            occupancy_map=world.occupancy_map,
-            poses=told.states.pose[e],
-            goal=told.states.goal[e, 0],
-            ranges=told.observations.ranges[e] * config.max_range,
-            covered=told.states.covered[e],
-            actions=told.actions[e],
-            rewards=told.rewards[e],
-            reward_parts=reward_parts[e],
-            goal_distances=info["goal_distance"][e],
-            reachable=info["reward_navigation"][e] > 0,
-            collisions=info["collision"][e],
-            covered_areas=info["covered_area"][e],
-            skill_weights=told.outputs.skill_weights[e],
-            skill_q_values=told.outputs.skill_q_values[e],
-            q_values=told.outputs.q_values[e],
-            field_of_view=math.radians(config.field_of_view_deg),
-            max_range=config.max_range,
-            goal_radius=float(params.goal_radius),
-            robot_radius=config.robot_radius,
-            time_step=float(params.time_step),
-            lattice=params.lattice,
-        )
-        for e in range(len(told.actions))
+        Episode(agent.name, world.occupancy_map, env_params, recorded.of_robots(index))
+        for index in range(len(keys))
     ]
+
+
+@jax.jit
+def _covered(poses: Array, env_params: EnvParams) -> Array:
+    """[T + 1, E, ...] the points covered along poses [T + 1, E, 3]."""
+    return jax.vmap(covered_along, in_axes=(1, None), out_axes=1)(poses, env_params)

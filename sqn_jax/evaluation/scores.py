@@ -1,4 +1,4 @@
-"""From driven episodes to numbers: statistics of an evaluation, one record an episode, a table.
+"""From batches of episodes to numbers: statistics of an evaluation, records, a table.
 
 NumPy on the host; knows nothing of how the episodes came about.
 """
@@ -6,66 +6,31 @@ NumPy on the host; knows nothing of how the episodes came about.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from sqn_jax.evaluation.agents import EpisodeBatch
 from sqn_jax.evaluation.statistics import (
     bootstrap_interval,
     interquartile_mean,
     probability_of_improvement,
     stratified_bootstrap,
-    success_weighted_path_length,
     wilson_interval,
 )
-from sqn_jax.training.rollout import EpisodeSummary
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The episodes of one training seed under one evaluation seed, E of them."""
-
-    training_seed: int | None
-    """None for a navigator that was not trained."""
-    eval_seed: int
-    summary: EpisodeSummary
-    """Arrays [E]."""
-    starts: NDArray[np.floating]
-    """[E, 3] x m, y m, heading rad."""
-    goals: NDArray[np.floating]
-    """[E, 2] m."""
-    shortest: NDArray[np.floating] | None = None
-    """[E] m, length of the shortest way from start to goal; None where it was not worked out."""
-
-    @cached_property
-    def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """Every number of an episode by the name it has in the files, [E] each."""
-        summary = self.summary
-        named: dict[str, ArrayLike] = {
-            "success": summary.success,
-            "time_steps": summary.time_steps,
-            "mean_reward": summary.mean_reward,
-            "collisions": summary.collisions,
-            "coverage_m2": summary.covered_area,
-            "path_length_m": summary.path_length,
-        }
-        if self.shortest is not None:
-            named["spl"] = success_weighted_path_length(
-                summary.success, summary.path_length, self.shortest
-            )
-        return {name: np.asarray(values, np.float64) for name, values in named.items()}
 
 
 def describe(
-    outcomes: Sequence[Outcome], oracle: Sequence[Outcome] | None = None
+    batches: Sequence[EpisodeBatch],
+    goal_radius: float,
+    oracle: Sequence[EpisodeBatch] | None = None,
 ) -> dict[str, Any]:
     """Statistics over all episodes of an agent in one world, ready for JSON.
 
     Args:
-        outcomes: one for each training seed and evaluation seed, of equally many episodes.
+        batches: one for each training seed and evaluation seed, of equally many episodes.
+        goal_radius: m, what counts as reaching the goal.
         oracle: those of the oracle on the same tasks, one for each evaluation seed.
 
     Returns:
@@ -78,34 +43,40 @@ def describe(
         With several training seeds also `iqm` and `iqm_ci95`, the interquartile mean over them;
         the intervals over episodes say nothing of how much training seeds differ.
     """
-    metrics = [outcome.metrics for outcome in outcomes]
+    metrics = [batch.numbers(goal_radius) for batch in batches]
     result: dict[str, Any] = {}
     names = ("success", "time_steps", "spl", "mean_reward", "collisions", "coverage_m2")
     for name in names:
         values = [metric[name] for metric in metrics if name in metric]
-        result[name] = _describe(name, values, outcomes) if len(values) == len(metrics) else None
+        known = len(values) == len(metrics)
+        result[name] = _describe(name, values, batches, goal_radius) if known else None
     steps = [metric["time_steps"][metric["success"] > 0] for metric in metrics]
     result["time_steps_success"] = _over_episodes(np.concatenate(steps))
-    result["steps_over_oracle"] = _over_episodes(_steps_over_oracle(outcomes, oracle or []))
-    result["success_per_seed"] = _of_each_seed("success", outcomes)
+    ratios = _steps_over_oracle(batches, goal_radius, oracle or [])
+    result["steps_over_oracle"] = _over_episodes(ratios)
+    result["success_per_seed"] = _of_each_seed("success", batches, goal_radius)
     return result
 
 
 def _steps_over_oracle(
-    outcomes: Sequence[Outcome], oracle: Sequence[Outcome]
+    batches: Sequence[EpisodeBatch], goal_radius: float, oracle: Sequence[EpisodeBatch]
 ) -> NDArray[np.float64]:
     """Steps over the oracle's, of every task in which both arrive."""
     same = {each.eval_seed: each for each in oracle}
     ratios = [np.empty(0)]
-    for outcome in (outcome for outcome in outcomes if outcome.eval_seed in same):
-        ours, theirs = outcome.metrics, same[outcome.eval_seed].metrics
+    for batch in (batch for batch in batches if batch.eval_seed in same):
+        ours = batch.numbers(goal_radius)
+        theirs = same[batch.eval_seed].numbers(goal_radius)
         both = (ours["success"] > 0) & (theirs["success"] > 0)
         ratios.append(ours["time_steps"][both] / theirs["time_steps"][both])
     return np.concatenate(ratios)
 
 
 def _describe(
-    name: str, values: list[NDArray[np.float64]], outcomes: Sequence[Outcome]
+    name: str,
+    values: list[NDArray[np.float64]],
+    batches: Sequence[EpisodeBatch],
+    goal_radius: float,
 ) -> dict[str, Any]:
     joined = np.concatenate(values)
     told = _over_episodes(joined)
@@ -113,18 +84,18 @@ def _describe(
     if name == "success":
         told["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
     told["std_of_means"] = float(np.std([value.mean() for value in values]))
-    scores = _of_each_seed(name, outcomes)
+    scores = _of_each_seed(name, batches, goal_radius)
     if len(scores) > 1:
         told["iqm"] = interquartile_mean(scores)
         told["iqm_ci95"] = list(stratified_bootstrap([scores], interquartile_mean))
     return told
 
 
-def _of_each_seed(name: str, outcomes: Sequence[Outcome]) -> list[float]:
+def _of_each_seed(name: str, batches: Sequence[EpisodeBatch], goal_radius: float) -> list[float]:
     """Mean of a metric over all episodes of each training seed."""
     by_seed: dict[int | None, list[NDArray[np.float64]]] = {}
-    for outcome in outcomes:
-        by_seed.setdefault(outcome.training_seed, []).append(outcome.metrics[name])
+    for batch in batches:
+        by_seed.setdefault(batch.training_seed, []).append(batch.numbers(goal_radius)[name])
     return [float(np.concatenate(values).mean()) for values in by_seed.values()]
 
 
@@ -138,18 +109,24 @@ def _over_episodes(values: NDArray[np.float64]) -> dict[str, Any] | None:
     }
 
 
-def improvement(ours: Sequence[Sequence[Outcome]], theirs: Sequence[Sequence[Outcome]]) -> Any:
+def improvement(
+    ours: Sequence[Sequence[EpisodeBatch]],
+    theirs: Sequence[Sequence[EpisodeBatch]],
+    goal_radius: float,
+) -> Any:
     """Probability that a training run of ours has more success than one of theirs.
 
     Args:
-        ours: for each task (map) the outcomes of an agent, of the same training seeds.
+        ours: for each task (map) the episodes of an agent, of the same training seeds.
         theirs: the same for another agent.
+        goal_radius: m, what counts as reaching the goal.
 
     Returns:
         `probability` and its `ci95` over training seeds; None unless both agents have several.
     """
     tables = [
-        np.array([_of_each_seed("success", task) for task in agent]).T for agent in (ours, theirs)
+        np.array([_of_each_seed("success", task, goal_radius) for task in agent]).T
+        for agent in (ours, theirs)
     ]
     if any(len(table) < 2 for table in tables):
         return None
@@ -159,24 +136,26 @@ def improvement(ours: Sequence[Sequence[Outcome]], theirs: Sequence[Sequence[Out
     }
 
 
-def records(outcomes: Sequence[Outcome], **labels: Any) -> Iterator[dict[str, Any]]:
+def records(
+    batches: Sequence[EpisodeBatch], goal_radius: float, /, **labels: Any
+) -> Iterator[dict[str, Any]]:
     """One flat object an episode, ready for JSON lines."""
-    for outcome in outcomes:
-        metrics = outcome.metrics
-        for episode in range(len(outcome.goals)):
+    for batch in batches:
+        numbers = batch.numbers(goal_radius)
+        for episode in range(len(batch.goals)):
             yield {
                 **labels,
-                "training_seed": outcome.training_seed,
-                "eval_seed": outcome.eval_seed,
+                "training_seed": batch.training_seed,
+                "eval_seed": batch.eval_seed,
                 "episode": episode,
-                "start": [float(x) for x in outcome.starts[episode]],
-                "goal": [float(x) for x in outcome.goals[episode]],
-                "success": bool(metrics["success"][episode]),
-                "time_steps": int(metrics["time_steps"][episode]),
-                "collisions": int(metrics["collisions"][episode]),
+                "start": [float(x) for x in batch.starts[episode]],
+                "goal": [float(x) for x in batch.goals[episode]],
+                "success": bool(numbers["success"][episode]),
+                "time_steps": int(numbers["time_steps"][episode]),
+                "collisions": int(numbers["collisions"][episode]),
                 **{
                     name: float(values[episode])
-                    for name, values in metrics.items()
+                    for name, values in numbers.items()
                     if name not in ("success", "time_steps", "collisions")
                 },
             }

@@ -5,7 +5,7 @@ No pyplot, no display, no global state: a figure belongs to nobody until `save` 
 """
 
 from sqn_jax.figures.animation import frames, gif, mp4
-from sqn_jax.figures.curves import gate_entropy, learning_curve, learning_curves
+from sqn_jax.figures.curves import gate_entropy_curves, learning_curve, learning_curves
 from sqn_jax.figures.episode import coverage_example, reachability_example
 from sqn_jax.figures.gallery import map_gallery, observation_patterns
 from sqn_jax.figures.noise import robustness
@@ -23,7 +23,7 @@ __all__ = [
     "coverage_example",
     "episode_timeline",
     "frames",
-    "gate_entropy",
+    "gate_entropy_curves",
     "gif",
     "learning_curve",
     "learning_curves",

@@ -195,7 +195,7 @@ def _draw_band(
         axes.fill_between(episodes, low, high, color=colour, alpha=0.2, lw=0)
 
 
-def gate_entropy(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
+def gate_entropy_curves(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
     """Draw how decided the skill decision became in training, and how different the skills.
 
     Args:

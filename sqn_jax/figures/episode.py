@@ -100,7 +100,7 @@ _LEGEND_BELOW: dict[str, Any] = {
 
 def seen_areas(episode: Episode) -> Floats:
     """[T + 1] m2 seen before each step and after the last, counted from the covered points."""
-    counts = np.bitwise_count(episode.covered).sum(axis=(1, 2, 3), dtype=np.int64)
+    counts = np.bitwise_count(episode.trajectory.covered).sum(axis=(1, 2, 3), dtype=np.int64)
     return counts * episode.lattice.cell**2
 
 
@@ -242,9 +242,7 @@ def _clear_ones(moments: list[Moment]) -> list[Moment]:
 def _moments(episode: Episode) -> list[Moment]:
     """The moments before the arrival with the goal within the sensor's reach and field of view."""
     end = episode.time_steps
-    x, y, heading = episode.poses[1 : end + 1].T
-    direction = np.arctan2(episode.goal[1] - y, episode.goal[0] - x) - heading
-    direction = (direction + math.pi) % (2 * math.pi) - math.pi
+    direction = episode.goal_headings()[1 : end + 1]
     distances = episode.goal_distances[:end]
     in_view = np.abs(direction) <= episode.field_of_view / 2
     moments = []

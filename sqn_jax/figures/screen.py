@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from sqn_jax.evaluation.recording import Episode, covered_bits
+from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import (
     FREE,
     ONE_SKILL,
@@ -191,7 +191,7 @@ class Screen:
 
     def _seen(self, index: int) -> NDArray[np.bool_]:
         """`Episode.covered_mask` at the panel's pixels, the upper row first."""
-        mask: NDArray[np.bool_] = covered_bits(self.episode.covered[index]).ravel()[self._nearest]
+        mask: NDArray[np.bool_] = self.episode.covered_bits(index).ravel()[self._nearest]
         return mask
 
     def _draw_legend(self, place: tuple[int, int, int, int]) -> None:
@@ -253,6 +253,7 @@ class Screen:
         axes.add_patch(robot)
         self._add(axes, robot)
         self._own_goal = self._add(axes, star)
+        self._goal_headings = self.episode.goal_headings()
 
     def _update_view(self, index: int) -> None:
         episode = self.episode
@@ -260,11 +261,9 @@ class Screen:
         ends = np.stack([-ranges * np.sin(angles), ranges * np.cos(angles)], axis=-1)
         self._own_scan.set_xy(np.concatenate([ends, np.zeros((1, 2))]))
         self._hits.set_data(*ends[ranges < 0.999 * episode.max_range].T)
-        x, y, heading = (float(value) for value in episode.poses[index])
-        away = math.hypot(episode.goal[0] - x, episode.goal[1] - y)
-        bearing = math.atan2(episode.goal[1] - y, episode.goal[0] - x) - heading
-        shown = min(away, episode.max_range)
-        self._own_goal.set_data([-shown * math.sin(bearing)], [shown * math.cos(bearing)])
+        away = math.dist(episode.poses[index, :2], episode.goal)
+        shown, heading = min(away, episode.max_range), float(self._goal_headings[index])
+        self._own_goal.set_data([-shown * math.sin(heading)], [shown * math.cos(heading)])
 
     # ----------------------------------------------------------------------------- skills, rewards
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -16,10 +15,6 @@ from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
 
 _REWARD_PARTS = ("navigation", "exploration", "time")
 _PART_STYLES = ((COLOURS[2], "-"), (COLOURS[5], "--"), ("#7a7a7a", "-."))
-_OF_STEPS = (
-    *("actions", "rewards", "reward_parts", "goal_distances", "reachable", "collisions"),
-    *("covered_areas", "skill_weights", "skill_q_values", "q_values"),
-)
 
 
 def episode_timeline(episode: Episode, *, title: str) -> Figure:
@@ -35,7 +30,7 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
         episode: what is drawn.
         title: stands above all panels, with the outcome below it.
     """
-    episode = _first_steps(episode, math.ceil(1.25 * episode.time_steps))
+    episode = episode.first_steps(math.ceil(1.25 * episode.time_steps))
     skills = episode.skill_weights.shape[1]
     count = 4 if skills > 1 else 3
     size = (WIDTH_IN, 1.75 * count + 0.9)
@@ -60,12 +55,6 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
     word = "reached after" if episode.success else "not reached in"
     figure.suptitle(plain(f"{title}\ngoal {word} {outcome}"), fontsize=12)
     return figure
-
-
-def _first_steps(episode: Episode, steps: int) -> Episode:
-    """The beginning of an episode, at most all of it; what was covered and seen stays whole."""
-    first: dict[str, Any] = {name: getattr(episode, name)[:steps] for name in _OF_STEPS}
-    return dataclasses.replace(episode, poses=episode.poses[: steps + 1], **first)
 
 
 def _draw_weights(axes: Axes, episode: Episode) -> None:

@@ -1,4 +1,4 @@
-"""What a report says: the runs as they were found, and what they do when they are driven."""
+"""What a report says: the runs as they are on the disk, and what comes of their evaluation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.evaluation.compare import (
-    Agent,
-    Driven,
+    EpisodeBatch,
     Learnt,
     Settings,
-    World,
     evaluate_agents,
     group_policies,
     load_maps,
@@ -28,7 +24,7 @@ from sqn_jax.evaluation.compare import (
 )
 from sqn_jax.policies.pretrained import find_policy, names_a_run
 from sqn_jax.policies.run_policies import Policy
-from sqn_jax.report.episodes import Drive, Hard, hardest
+from sqn_jax.report.episodes import HardEpisode, hardest
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.run_folder import RunFolder
 
@@ -55,9 +51,9 @@ class Content:
     settings: Settings
     evaluation: dict[str, Any]
     """As `compare.evaluate_agents` returns it, the references among it."""
-    drives: list[Drive]
+    batches: list[EpisodeBatch]
     """The episodes of the agents, without those of the references."""
-    hardest: list[Hard]
+    hardest: list[HardEpisode]
     """Three at most."""
 
 
@@ -106,7 +102,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def gather(runs: Sequence[Run], settings: Settings, *, references: bool) -> Content:
-    """Drive the runs under a progress bar.
+    """Evaluate the runs under a progress bar.
 
     Raises:
         ValueError: a map is unusable for a robot, or runs cannot be told apart.
@@ -117,42 +113,18 @@ def gather(runs: Sequence[Run], settings: Settings, *, references: bool) -> Cont
             raise ValueError(f"{times} runs are called {name!r}, expected different names")
     agents = with_references(learnt, references=references)
     maps = load_maps(agents, settings)
-    drives: list[Drive] = []
+    batches: list[EpisodeBatch] = []
 
-    def keep(agent: Agent, world: World, index: int, driven: Driven) -> None:
-        if isinstance(agent, Learnt):
-            drives.append(_drive(agent, world, index, driven, drives, settings))
+    def keep(batch: EpisodeBatch) -> None:
+        if isinstance(batch.agent, Learnt):
+            batches.append(batch)
 
     with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluation, _ = evaluate_agents(agents, maps, settings, bar.update, keep)
+        evaluation, _ = evaluate_agents(
+            agents, maps, settings, bar.update, keep, fields=("info", "output")
+        )
     print("looking at what went worst, and drawing it ...", flush=True)
-    return Content(list(runs), learnt, settings, evaluation, drives, hardest(drives))
-
-
-def _drive(
-    agent: Learnt,
-    world: World,
-    index: int,
-    driven: Driven,
-    before: Sequence[Drive],
-    settings: Settings,
-) -> Drive:
-    """What is kept of the episodes just driven: evaluation seeds come one after the other."""
-    (summary, *_), trace = driven
-    earlier = sum(
-        (drive.agent is agent and drive.world is world and drive.index == index) for drive in before
-    )
-    return Drive(
-        agent=agent,
-        world=world,
-        index=index,
-        eval_seed=settings.seed + earlier,
-        summary=summary,
-        poses=np.asarray(trace.poses),
-        goals=np.asarray(trace.goals),
-        collisions=np.asarray(trace.collisions),
-        skill_weights=np.asarray(trace.skill_weights),
-    )
+    return Content(list(runs), learnt, settings, evaluation, batches, hardest(batches))
 
 
 def changed_settings(config: TrainConfig) -> tuple[str, list[tuple[str, Any, Any]]]:

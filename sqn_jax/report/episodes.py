@@ -9,34 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_ways
-from sqn_jax.evaluation.compare import Learnt, World
-from sqn_jax.training.rollout import EpisodeSummary
+from sqn_jax.evaluation.compare import EpisodeBatch, World
 
 Floats = NDArray[np.floating]
 
 NEAR = 1.0
 """m; how far around a place a robot counts as being there."""
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """E episodes of one policy in one world under one evaluation seed, T steps each."""
-
-    agent: Learnt
-    world: World
-    index: int
-    """Which of the agent's training seeds."""
-    eval_seed: int
-    summary: EpisodeSummary
-    """NumPy arrays [E]."""
-    poses: Floats
-    """[T + 1, E, 3] x m, y m, heading rad."""
-    goals: Floats
-    """[E, 2] x m, y m."""
-    collisions: NDArray[np.bool_]
-    """[T, E] the move was refused."""
-    skill_weights: Floats
-    """[T, E, K]."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +37,12 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Hard:
+class HardEpisode:
     """One episode that went badly."""
 
-    drive: Drive
+    batch: EpisodeBatch
     episode: int
-    """Which of the drive's."""
+    """Which of the batch's."""
     way: float
     """m, the shortest way from start to goal."""
     left: float
@@ -74,22 +52,22 @@ class Hard:
 
     @property
     def success(self) -> bool:
-        return bool(self.drive.summary.success[self.episode])
+        return bool(self.batch.main_metrics.success[self.episode])
 
     @property
     def steps(self) -> int:
         """Steps until the goal was reached; the whole episode for a failure."""
-        return int(self.drive.summary.time_steps[self.episode])
+        return int(self.batch.main_metrics.time_steps[self.episode])
 
     @property
     def refused(self) -> int:
         """Moves refused within these steps."""
-        return int(self.drive.collisions[: self.steps, self.episode].sum())
+        return int(self.batch.trajectory.info["collision"][: self.steps, self.episode].sum())
 
     @property
     def slowness(self) -> float:
         """Steps, as a multiple of those that the shortest way takes at full speed."""
-        return self.steps / _fewest_steps(self.drive, self.way)
+        return self.steps / _fewest_steps(self.batch, self.way)
 
 
 def densest_place(points: Floats) -> Place:
@@ -110,59 +88,59 @@ def densest_place(points: Floats) -> Place:
     return Place(float(densest[0]), float(densest[1]), best[0], len(points))
 
 
-def hardest(drives: Sequence[Drive], count: int = 3) -> list[Hard]:
+def hardest(batches: Sequence[EpisodeBatch], count: int = 3) -> list[HardEpisode]:
     """The episodes that went worst, the worst first.
 
     Failures come before successes: those with the longest way left over the map first. If they are
     too few, the successes that were slowest beside their shortest way follow.
 
     Args:
-        drives: all that was driven.
+        batches: all episodes, their trajectories with `info`.
         count: at most so many.
     """
-    found: list[Hard] = []
+    found: list[HardEpisode] = []
     for success in (False, True):
         if len(found) < count:
-            ranked = _ranked(drives, success=success)
+            ranked = _ranked(batches, success=success)
             found += [_looked_at(*each) for each in ranked[: count - len(found)]]
     return found
 
 
-def _ranked(drives: Sequence[Drive], *, success: bool) -> list[tuple[Drive, int]]:
+def _ranked(batches: Sequence[EpisodeBatch], *, success: bool) -> list[tuple[EpisodeBatch, int]]:
     """All failures or all successes, from the worst to the best."""
     ranks: list[tuple[float, int, int]] = []
-    numbered = list(enumerate(drives))
-    for world in {id(drive.world): drive.world for drive in drives}.values():
+    numbered = list(enumerate(batches))
+    for world in {id(batch.world): batch.world for batch in batches}.values():
         # Together, since agents have goals in common and a distance field takes its time.
-        same = [(number, drive) for number, drive in numbered if drive.world is world]
+        same = [(number, batch) for number, batch in numbered if batch.world is world]
         chosen = [
             (number, episode)
-            for number, drive in same
-            for episode in np.flatnonzero(np.asarray(drive.summary.success) == success)
+            for number, batch in same
+            for episode in np.flatnonzero(np.asarray(batch.main_metrics.success) == success)
         ]
         if not chosen:
             continue
         moment = 0 if success else -1
-        places = np.stack([drives[number].poses[moment, episode] for number, episode in chosen])
-        goals = np.stack([drives[number].goals[episode] for number, episode in chosen])
+        places = np.stack([batches[n].trajectory.poses[moment, episode] for n, episode in chosen])
+        goals = np.stack([batches[number].goals[episode] for number, episode in chosen])
         ways = _ways(world, places, goals)
         for (number, episode), way in zip(chosen, ways, strict=True):
-            drive = drives[number]
-            steps = float(drive.summary.time_steps[episode])
-            badness = steps / _fewest_steps(drive, way) if success else float(way)
+            batch = batches[number]
+            steps = float(batch.main_metrics.time_steps[episode])
+            badness = steps / _fewest_steps(batch, way) if success else float(way)
             ranks.append((-badness, number, int(episode)))
-    return [(drives[number], episode) for _, number, episode in sorted(ranks)]
+    return [(batches[number], episode) for _, number, episode in sorted(ranks)]
 
 
-def _looked_at(drive: Drive, episode: int) -> Hard:
-    success = bool(drive.summary.success[episode])
-    steps = int(drive.summary.time_steps[episode])
+def _looked_at(batch: EpisodeBatch, episode: int) -> HardEpisode:
+    success = bool(batch.main_metrics.success[episode])
+    steps = int(batch.main_metrics.time_steps[episode])
+    poses = batch.trajectory.poses[:, episode]
     first = 0 if success else steps // 2
-    ends = drive.poses[[0, -1], episode]
-    goals = drive.goals[[episode, episode]]
-    way, left = (float(length) for length in _ways(drive.world, ends, goals))
-    place = densest_place(drive.poses[first + 1 : steps + 1, episode, :2])
-    return Hard(drive, episode, way, 0.0 if success else left, place)
+    goals = batch.goals[[episode, episode]]
+    way, left = (float(length) for length in _ways(batch.world, poses[[0, -1]], goals))
+    place = densest_place(poses[first + 1 : steps + 1, :2])
+    return HardEpisode(batch, episode, way, 0.0 if success else left, place)
 
 
 def _ways(
@@ -172,7 +150,7 @@ def _ways(
     return shortest_ways(world.occupancy_map, places, goals, robot_radius=robot_radius)
 
 
-def _fewest_steps(drive: Drive, way: float) -> float:
+def _fewest_steps(batch: EpisodeBatch, way: float) -> float:
     """Steps that a way takes at full speed; at least one."""
-    config = drive.world.env_params.config
+    config = batch.world.env_params.config
     return max(1.0, way / (config.forward_speed * config.time_step))

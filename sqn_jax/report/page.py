@@ -16,8 +16,8 @@ from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.compare import Settings
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.report.content import Content, Run, changed_settings
-from sqn_jax.report.episodes import NEAR, Hard
-from sqn_jax.report.pictures import Picture, Pictures, policy_words
+from sqn_jax.report.episodes import NEAR, HardEpisode
+from sqn_jax.report.pictures import Illustration, Illustrations
 from sqn_jax.storage.files import probe_writable, written_whole
 from sqn_jax.storage.run_folder import CONFIG
 
@@ -85,7 +85,7 @@ def write(path: Path, html: str) -> None:
         partial.write_text(html, encoding="utf-8", errors="replace", newline="\n")
 
 
-def to_html(content: Content, pictures: Pictures) -> str:
+def to_html(content: Content, pictures: Illustrations) -> str:
     """The page as text; the same content and pictures give the same text."""
     title = f"Report on {', '.join(run.name for run in content.runs)}"
     sections = [
@@ -94,7 +94,7 @@ def to_html(content: Content, pictures: Pictures) -> str:
         f'<p class="note">{escape(_how(content.settings))}</p>',
         *_hardest(content.hardest, pictures.hardest),
         "<h2>Success and time steps</h2>",
-        results_table(content.evaluation["results"], content.settings),
+        success_table(content.evaluation["results"], content.settings),
         *_training(content, pictures),
         "<h2>Paths</h2>",
         *map(_figure, pictures.paths),
@@ -169,7 +169,7 @@ def _how(settings: Settings) -> str:
     )
 
 
-def _hardest(hardest: Sequence[Hard], pictures: Sequence[Picture]) -> Iterable[str]:
+def _hardest(hardest: Sequence[HardEpisode], pictures: Sequence[Illustration]) -> Iterable[str]:
     failures = sum(not hard.success for hard in hardest)
     yield "<h2>What went worst</h2>"
     if failures == len(hardest):
@@ -180,7 +180,7 @@ def _hardest(hardest: Sequence[Hard], pictures: Sequence[Picture]) -> Iterable[s
         rule = "No episode failed: the successes that were slowest beside their shortest way."
     yield f'<p class="note">{rule}</p>'
     for number, (hard, picture) in enumerate(zip(hardest, pictures, strict=True), start=1):
-        heading = f"{number}. {hard.drive.world.occupancy_map.name}: {_in_short(hard)}"
+        heading = f"{number}. {hard.batch.world.occupancy_map.name}: {_in_short(hard)}"
         yield '<section class="hard">'
         yield f"<h3>{escape(heading)}</h3>"
         yield f"<p>{escape(words(hard))}</p>"
@@ -188,7 +188,7 @@ def _hardest(hardest: Sequence[Hard], pictures: Sequence[Picture]) -> Iterable[s
         yield "</section>"
 
 
-def _in_short(hard: Hard) -> str:
+def _in_short(hard: HardEpisode) -> str:
     if hard.success:
         return f"reached, in {hard.slowness:.1f} times the steps of the shortest way"
     return f"{_metres(hard.left)} of way left"
@@ -198,10 +198,10 @@ def _metres(length: float) -> str:
     return f"{length:.1f} m" if np.isfinite(length) else "no end"
 
 
-def words(hard: Hard) -> str:
+def words(hard: HardEpisode) -> str:
     """What happened in an episode, with numbers."""
-    drive, place = hard.drive, hard.place
-    start, goal = drive.poses[0, hard.episode], drive.goals[hard.episode]
+    batch, place = hard.batch, hard.place
+    start, goal = batch.starts[hard.episode], batch.goals[hard.episode]
     there = f"within {NEAR:g} m of ({place.x:.1f}, {place.y:.1f}) m"
     share = f"{place.steps:,} of the last {place.of:,} steps"
     if hard.success:
@@ -220,14 +220,15 @@ def words(hard: Hard) -> str:
         )
     moves = {0: "No move was", 1: "1 move was"}.get(hard.refused, f"{hard.refused:,} moves were")
     return (
-        f"{drive.agent.name}, {policy_words(drive)}, on {drive.world.occupancy_map.name} "
-        f"({drive.world.tasks}, episode {hard.episode} of evaluation seed {drive.eval_seed}): "
+        f"{batch.agent.name}, training seed {batch.training_seed}, on "
+        f"{batch.world.occupancy_map.name} "
+        f"({batch.world.tasks}, episode {hard.episode} of evaluation seed {batch.eval_seed}): "
         f"from ({start[0]:.1f}, {start[1]:.1f}) m to the goal at ({goal[0]:.1f}, {goal[1]:.1f}) m. "
         f"{end} {moves} refused."
     )
 
 
-def results_table(results: Sequence[dict[str, Any]], settings: Settings) -> str:
+def success_table(results: Sequence[dict[str, Any]], settings: Settings) -> str:
     """Success and time steps: agents, references and the paper below each other, maps across."""
     worlds = list(dict.fromkeys((entry["map"], entry["tasks"]) for entry in results))
     agents = {entry["agent"]: entry["algorithm"] for entry in results}
@@ -285,18 +286,18 @@ def _row(name: str, cells: Sequence[tuple[str, str]], look: str) -> str:
     return f'<tr class="{look}"><th scope="row">{escape(name)}</th>{told}</tr>'
 
 
-def _training(content: Content, pictures: Pictures) -> Iterable[str]:
+def _training(content: Content, pictures: Illustrations) -> Iterable[str]:
     if pictures.curves:
         yield "<h2>Training</h2>"
         yield from map(_figure, pictures.curves)
 
 
-def _left_out(pictures: Pictures) -> Iterable[str]:
+def _left_out(pictures: Illustrations) -> Iterable[str]:
     if pictures.paths_left_out:
         yield f'<p class="note">{pictures.paths_left_out} more pictures are left out.</p>'
 
 
-def _figure(picture: Picture) -> str:
+def _figure(picture: Illustration) -> str:
     kind = "gif" if picture.data.startswith(b"GIF8") else "png"
     data = base64.b64encode(picture.data).decode("ascii")
     return (

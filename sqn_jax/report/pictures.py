@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.evaluation.compare import Learnt, task_key
+from sqn_jax.evaluation.compare import EpisodeBatch, Learnt
 from sqn_jax.evaluation.episodes import episode_keys
-from sqn_jax.evaluation.recording import Episode, on_host, record_episodes
+from sqn_jax.evaluation.recording import Episode, record_episodes
+from sqn_jax.evaluation.settings import task_key
 from sqn_jax.figures.animation import gif
 from sqn_jax.report.content import Content, Run
-from sqn_jax.report.episodes import NEAR, Drive, Hard, Place
+from sqn_jax.report.episodes import NEAR, HardEpisode, Place
 
 MOST_BYTES = 7_000_000
 """Of all pictures of a page, which is a third larger; pictures of paths beyond it are left out."""
@@ -24,7 +25,7 @@ _INK, _PAPER = "#222222", "white"
 
 
 @dataclass(frozen=True)
-class Picture:
+class Illustration:
     """A PNG or GIF file, and what it shows."""
 
     data: bytes
@@ -34,60 +35,60 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class Illustrations:
     """All pictures of a page."""
 
-    hardest: list[Picture]
+    hardest: list[Illustration]
     """One for each of `Content.hardest`."""
-    curves: list[Picture]
-    paths: list[Picture]
+    curves: list[Illustration]
+    paths: list[Illustration]
     paths_left_out: int
     """How many more there would be."""
-    animation: Picture
+    animation: Illustration
 
 
-def draw(content: Content) -> Pictures:
+def draw(content: Content) -> Illustrations:
     """Draw all that a page shows."""
     hardest = [_hard_picture(hard) for hard in content.hardest]
     training = curves(content)
     animation = _animation(content)
     room = MOST_BYTES - sum(len(each.data) for each in (*hardest, *training, animation))
-    first = _first_drives(content.drives)
-    paths: list[Picture] = []
-    for drive in first:
-        paths.append(_paths(drive))
+    first = _first_batches(content.batches)
+    paths: list[Illustration] = []
+    for batch in first:
+        paths.append(_paths(batch))
         room -= len(paths[-1].data)
         if room < 0:
             break
-    return Pictures(hardest, training, paths, len(first) - len(paths), animation)
+    return Illustrations(hardest, training, paths, len(first) - len(paths), animation)
 
 
-def _title(drive: Drive) -> str:
-    return f"{drive.agent.name} on {drive.world.occupancy_map.name}, {drive.world.tasks}"
+def _title(batch: EpisodeBatch) -> str:
+    return f"{batch.agent.name} on {batch.world.occupancy_map.name}, {batch.world.tasks}"
 
 
-def _trajectories(drive: Drive, chosen: slice, title: str) -> Any:
-    """Episodes of a drive over the distance fields of their goals."""
-    config = drive.world.env_params.config
+def _trajectories(batch: EpisodeBatch, chosen: slice, title: str) -> Any:
+    """Episodes of a batch over the distance fields of their goals."""
+    env_params, trajectory = batch.world.env_params, batch.trajectory
     return figures.trajectories(
-        drive.world.occupancy_map,
-        drive.goals[chosen],
-        drive.poses[:, chosen],
-        drive.skill_weights[:, chosen],
-        drive.summary.success[chosen],
-        drive.summary.time_steps[chosen],
-        goal_radius=float(drive.world.env_params.goal_radius),
-        robot_radius=config.robot_radius,
+        batch.world.occupancy_map,
+        batch.goals[chosen],
+        trajectory.poses[:, chosen],
+        trajectory.output.skill_weights[:, chosen],
+        batch.main_metrics.success[chosen],
+        batch.main_metrics.time_steps[chosen],
+        goal_radius=float(env_params.goal_radius),
+        robot_radius=env_params.config.robot_radius,
         title=title,
     )
 
 
-def _hard_picture(hard: Hard) -> Picture:
+def _hard_picture(hard: HardEpisode) -> Illustration:
     """The path, and a circle around the place where the robot was most of the time."""
     episode = slice(hard.episode, hard.episode + 1)
-    figure = _trajectories(hard.drive, episode, f"{_title(hard.drive)}, episode {hard.episode}")
+    figure = _trajectories(hard.batch, episode, f"{_title(hard.batch)}, episode {hard.episode}")
     _mark(figure.axes[0], hard.place, stuck=not hard.success and hard.place.is_most)
-    return Picture(
+    return Illustration(
         figures.picture(figure).png,
         "The path of the robot over the distance to its goal, with a circle around the place "
         f"({hard.place.x:.1f}, {hard.place.y:.1f}) m.",
@@ -120,7 +121,7 @@ def _mark(axes: Any, place: Place, *, stuck: bool) -> None:
     )
 
 
-def curves(content: Content) -> list[Picture]:
+def curves(content: Content) -> list[Illustration]:
     """How training went: of one run all curves, of several the two that compare them."""
     told = [run for run in content.runs if run.metrics]
     if not told:
@@ -144,7 +145,7 @@ def curves(content: Content) -> list[Picture]:
     ]
     gated = {run.name: run.metrics for run in told if _tells_of_skills(run)}
     if gated:
-        figure = figures.gate_entropy(gated, title="Entropy of the skill decision")
+        figure = figures.gate_entropy_curves(gated, title="Entropy of the skill decision")
         pictures.append(_curve(figure, "How evenly the skills share the decision."))
     return pictures
 
@@ -157,68 +158,47 @@ def _tells_of_skills(run: Run) -> bool:
     return has_skills and all(names <= row.keys() for row in run.metrics)
 
 
-def _curve(figure: Any, caption: str) -> Picture:
-    return Picture(figures.picture(figure).png, "Curves over the episodes of training.", caption)
-
-
-def _first_drives(drives: Sequence[Drive]) -> list[Drive]:
-    """Of each agent in each world the first training seed under the first evaluation seed."""
-    first: dict[tuple[str, int], Drive] = {}
-    for drive in drives:
-        first.setdefault((drive.agent.name, id(drive.world)), drive)
-    return list(first.values())
-
-
-def _paths(drive: Drive) -> Picture:
-    return Picture(
-        figures.picture(_trajectories(drive, slice(None), _title(drive))).png,
-        f"Paths of {_title(drive)}, over the distance to the goal.",
-        f"{_title(drive)}: {policy_words(drive)}, {len(drive.goals)} episodes under evaluation "
-        f"seed {drive.eval_seed}.",
+def _curve(figure: Any, caption: str) -> Illustration:
+    return Illustration(
+        figures.picture(figure).png, "Curves over the episodes of training.", caption
     )
 
 
-def policy_words(drive: Drive) -> str:
-    """Which of an agent's policies drove."""
-    return f"training seed {drive.agent.training_seeds[drive.index]}"
+def _first_batches(batches: Sequence[EpisodeBatch]) -> list[EpisodeBatch]:
+    """Of each agent in each world the first training seed under the first evaluation seed."""
+    first: dict[tuple[str, int], EpisodeBatch] = {}
+    for batch in batches:
+        first.setdefault((batch.agent.name, id(batch.world)), batch)
+    return list(first.values())
 
 
-def _animation(content: Content) -> Picture:
+def _paths(batch: EpisodeBatch) -> Illustration:
+    return Illustration(
+        figures.picture(_trajectories(batch, slice(None), _title(batch))).png,
+        f"Paths of {_title(batch)}, over the distance to the goal.",
+        f"{_title(batch)}: training seed {batch.training_seed}, {len(batch.goals)} episodes under "
+        f"evaluation seed {batch.eval_seed}.",
+    )
+
+
+def _animation(content: Content) -> Illustration:
     """The worst failure; if there is none, the first episode of all."""
     failures = [hard for hard in content.hardest if not hard.success]
-    drive, number = content.drives[0], 0
+    batch, number = content.batches[0], 0
     if failures:
-        drive, number = failures[0].drive, failures[0].episode
-    episode = _recorded(drive, number)
+        batch, number = failures[0].batch, failures[0].episode
+    episode = _recorded(batch, number)
     outcome = f"not reached within {episode.num_steps:,} steps"
     if episode.success:
         outcome = f"reached after {episode.time_steps:,} steps"
     data = gif(episode, count=_FRAMES, width_px=_FRAME_WIDTH_PX)
-    told = f"{_title(drive)}, episode {number} of evaluation seed {drive.eval_seed}: {outcome}"
-    note = ""
-    if episode.success != bool(drive.summary.success[number]):
-        note = (
-            " Driven again for the animation, it went otherwise than in the evaluation: sums are "
-            "rounded in another order, and one different turn is enough."
-        )
-    return Picture(data, f"An animation of {told}.", f"{told}.{note}")
+    shown = f"{_title(batch)}, episode {number} of evaluation seed {batch.eval_seed}: {outcome}"
+    return Illustration(data, f"An animation of {shown}.", f"{shown}.")
 
 
-def _recorded(drive: Drive, number: int) -> Episode:
-    """One of the episodes with all that a picture of it needs, driven again alone."""
-    world, agent = drive.world, drive.agent
-    keys = episode_keys(task_key(drive.eval_seed, world.tasks), number + 1)[number:]
-    config = agent.policies[0].config
-    recording = record_episodes(
-        keys,
-        _params(agent, drive.index),
-        world.env_params,
-        algo=config.algo,
-        network_config=config.network,
-    )
-    (episode,) = on_host(recording, world, agent=agent.name)
+def _recorded(batch: EpisodeBatch, number: int) -> Episode:
+    """One of the episodes with all that a film of it needs."""
+    assert isinstance(batch.agent, Learnt)
+    keys = episode_keys(task_key(batch.eval_seed, batch.world.tasks), number + 1)[number:]
+    (episode,) = record_episodes(keys, batch.agent, batch.training_seed, batch.world)
     return episode
-
-
-def _params(agent: Learnt, index: int) -> Any:
-    return [params for policy in agent.policies for params in policy.params][index]

@@ -1,11 +1,10 @@
 """Films and pictures of what trained policies do on a map: what `sqn render` does.
 
-Every policy drives the same tasks, `recording` keeps them whole, `figures` draws them.
+Every policy is given the same tasks, `recording` keeps its episodes, `figures` draws them.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -17,8 +16,10 @@ from tqdm import tqdm
 from sqn_jax import figures
 from sqn_jax.config import EnvConfig
 from sqn_jax.config.map_names import parse
-from sqn_jax.evaluation.compare import Learnt, Settings, Tasks, World, load_maps, robot_for, worlds
-from sqn_jax.evaluation.recording import Episode, record_world
+from sqn_jax.evaluation.compare import Learnt, Settings, Tasks, World, load_maps
+from sqn_jax.evaluation.episodes import episode_keys
+from sqn_jax.evaluation.recording import Episode, record_episodes
+from sqn_jax.evaluation.settings import robot_for, task_key, worlds
 from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.policies.run_policies import Policy
@@ -28,7 +29,7 @@ from sqn_jax.storage.files import probe_writable, written_whole
 MOST_EPISODES = 32
 """Of each policy; an episode in the cave takes 7 MB of memory."""
 
-Episodes = Mapping[str, list[Episode]]
+EpisodesByAgent = Mapping[str, list[Episode]]
 
 
 @kept_programs()
@@ -86,17 +87,18 @@ def render_session(
     maps = load_maps(list(agents.values()), settings)
     _make_folder(out)
     ready: dict[EnvConfig, World] = {}
-    driven: dict[str, list[Episode]] = {}
+    keys = episode_keys(task_key(seed, tasks), episodes)
+    recorded: dict[str, list[Episode]] = {}
     for name, agent in agents.items():
         robot = robot_for(agent.env_config, settings)
         if robot not in ready:
             print(f"preparing {map_name} for the robot ...", flush=True)
             (ready[robot],) = worlds(robot, maps, settings)
         print(f"{name} drives ...", end="", flush=True)
-        told = record_world(agent.policies[0], ready[robot], episodes=episodes, seed=seed)
-        driven[name] = [dataclasses.replace(episode, agent=name) for episode in told]
-        print(f"\r{name}: {_outcome(told)}")
-    return _draw(driven, out, tasks=tasks, animations=animations, mp4=mp4)
+        seed_of_first = agent.training_seeds[0]
+        recorded[name] = record_episodes(keys, agent, seed_of_first, ready[robot])
+        print(f"\r{name}: {_outcome(recorded[name])}")
+    return _draw(recorded, out, tasks=tasks, animations=animations, mp4=mp4)
 
 
 def agent_names(policies: Sequence[Policy]) -> dict[str, Policy]:
@@ -152,12 +154,14 @@ def _outcome(episodes: Sequence[Episode]) -> str:
     return told + (f", {sum(reached) / len(reached):.0f} steps on average" if reached else "")
 
 
-def _draw(driven: Episodes, out: Path, *, tasks: Tasks, animations: int, mp4: bool) -> list[Path]:
+def _draw(
+    recorded: EpisodesByAgent, out: Path, *, tasks: Tasks, animations: int, mp4: bool
+) -> list[Path]:
     """Write all files under a progress bar; returns them."""
-    where = next(iter(driven.values()))[0].occupancy_map.name
+    where = next(iter(recorded.values()))[0].occupancy_map.name
     jobs: dict[Path, Callable[[Path], None]] = {}
-    jobs[out / "trajectories.png"] = partial(_draw_paths, driven, f"{where}, {tasks}")
-    for name, episodes in driven.items():
+    jobs[out / "trajectories.png"] = partial(_draw_paths, recorded, f"{where}, {tasks}")
+    for name, episodes in recorded.items():
         title = f"{name} on {where}, {tasks}, episode 1"
         file = _file_name(name)
         jobs[out / f"{file}_timeline_1.png"] = partial(_draw_timeline, episodes[0], title)
@@ -177,14 +181,14 @@ def _draw(driven: Episodes, out: Path, *, tasks: Tasks, animations: int, mp4: bo
     return list(jobs)
 
 
-def _draw_paths(driven: Episodes, title: str, path: Path) -> None:
+def _draw_paths(recorded: EpisodesByAgent, title: str, path: Path) -> None:
     """One agent's paths on one map, several agents task by task."""
-    if len(driven) == 1:
-        ((name, episodes),) = driven.items()
+    if len(recorded) == 1:
+        ((name, episodes),) = recorded.items()
         figures.save(figures.skill_trajectories(episodes, title=f"{name} on {title}"), path)
         return
-    first = {name: episodes[:MAX_TASKS] for name, episodes in driven.items()}
-    count = max(len(episodes) for episodes in driven.values())
+    first = {name: episodes[:MAX_TASKS] for name, episodes in recorded.items()}
+    count = max(len(episodes) for episodes in recorded.values())
     if count > MAX_TASKS:
         title += f", the first {MAX_TASKS} of {count} tasks"
     figures.save(figures.agents_side_by_side(first, title=title), path)

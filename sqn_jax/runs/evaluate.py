@@ -8,7 +8,7 @@ from typing import Any
 
 from sqn_jax.evaluation.compare import (
     Agent,
-    OnDriven,
+    OnEvaluated,
     Settings,
     evaluate_agents,
     load_maps,
@@ -24,25 +24,29 @@ def evaluate_session(
     agents: Sequence[Agent],
     settings: Settings,
     out: Path | None = None,
-    on_driven: OnDriven = lambda agent, world, index, driven: None,
+    on_evaluated: OnEvaluated = lambda batch: None,
+    fields: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Evaluate agents under a progress bar.
 
     Args:
-        agents: who drives; see `compare.evaluate_agents`.
+        agents: who acts; see `compare.evaluate_agents`.
         settings: where and how often.
         out: where to write the evaluation, a JSON file, and beside it one record an episode.
-        on_driven: see `compare.evaluate_agents`.
+        on_evaluated: see `compare.evaluate_agents`.
+        fields: see `compare.evaluate_agents`.
 
     Returns:
         The evaluation as written.
 
     Raises:
-        ValueError: a map is unusable for a robot; nothing was driven then.
+        ValueError: a map is unusable for a robot; nothing was run then.
     """
     maps = load_maps(agents, settings)
     with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluation, records = evaluate_agents(agents, maps, settings, bar.update, on_driven)
+        evaluation, records = evaluate_agents(
+            agents, maps, settings, bar.update, on_evaluated, fields
+        )
     if out is not None:
         write_json(out, evaluation)
         write_records(out.with_suffix(".jsonl"), records)

@@ -9,21 +9,17 @@ import jax
 import sqn_jax
 from sqn_jax.agent.learner import policy_params
 from sqn_jax.config import TrainConfig
-from sqn_jax.evaluation.compare import Agent, Driven, Learnt, Settings, World, evaluate_agents
+from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings, evaluate_agents
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices
-from sqn_jax.training.rollout import EpisodeSummary, Trace
 from sqn_jax.training.state import RunnerState
-
-Drawn = dict[str, tuple[EpisodeSummary, Trace]]
-"""For each kind of task, the episodes of the first seed."""
 
 
 def evaluate(
     runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
-) -> tuple[list[dict[str, Any]], Drawn]:
+) -> tuple[list[dict[str, Any]], list[EpisodeBatch]]:
     """Greedy episodes of every seed from the evaluation points and from random pairs.
 
     Args:
@@ -31,6 +27,9 @@ def evaluate(
         occupancy_map: the first map of the run.
         config: of the run.
         folder: of the run.
+
+    Returns:
+        The results, and for each kind of task the episodes of the first seed.
     """
     name = str(config.maps.names[0])
     # On one device: every program that is given them would else run on each of the mesh.
@@ -46,24 +45,27 @@ def evaluate(
         goal_radii=(config.env.goal_radius,),
         max_steps=config.env.max_steps,
     )
-    drawn: Drawn = {}
+    of_first_seed: list[EpisodeBatch] = []
 
-    def keep(_: Agent, world: World, index: int, driven: Driven) -> None:
-        if index == 0:
-            drawn[world.tasks] = (driven[0][0], driven[1])
+    def keep(batch: EpisodeBatch) -> None:
+        if batch.training_seed == policy.training_seeds[0]:
+            of_first_seed.append(batch)
 
     evaluation, records = evaluate_agents(
         [Learnt(config.algo, (policy,))],
         {(name, config.env.robot_radius): occupancy_map},
         settings,
-        on_driven=keep,
+        on_evaluated=keep,
+        fields=("output",),
     )
     folder.write_json("evaluation.json", evaluation)
     folder.write_records("evaluation.jsonl", records)
-    return evaluation["results"], drawn
+    return evaluation["results"], of_first_seed
 
 
-def draw(drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder) -> bool:
+def draw(
+    batches: list[EpisodeBatch], occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+) -> bool:
     """Write the figures; says so and returns False where Matplotlib is not installed."""
     try:
         from sqn_jax import figures
@@ -75,14 +77,15 @@ def draw(drawn: Drawn, occupancy_map: OccupancyMap, config: TrainConfig, folder:
         name += f" (trained on {count} maps)"
     curve = figures.learning_curve(folder.read_metrics(), title=name)
     figures.save(curve, folder.figures / "learning_curve.png")
-    for tasks, (summary, trace) in drawn.items():
+    for batch in batches:
+        tasks = batch.world.tasks
         drawing = figures.trajectories(
             occupancy_map,
-            trace.goals,
-            trace.poses,
-            trace.skill_weights,
-            summary.success,
-            summary.time_steps,
+            batch.goals,
+            batch.trajectory.poses,
+            batch.trajectory.output.skill_weights,
+            batch.main_metrics.success,
+            batch.main_metrics.time_steps,
             goal_radius=config.env.goal_radius,
             robot_radius=config.env.robot_radius,
             title=f"{name}, {tasks}" + (f", seed {config.seed}" if config.num_seeds > 1 else ""),

@@ -28,18 +28,18 @@ from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, current_discount, progress
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.shards import mean, own_shard
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.training.devices import compiler_options, place, placed_shapes
 from sqn_jax.training.rollout import (
-    Fleet,
-    Trace,
-    draw_chance,
+    ActorState,
+    episode_metrics,
     join_windows,
     own_worlds,
+    random_draws,
     restart_at_goal,
-    start_fleet,
-    summarize,
+    start_actors,
     unroll,
 )
 from sqn_jax.training.state import RunnerState, init_runner, runner_specs
@@ -47,7 +47,7 @@ from sqn_jax.training.state import RunnerState, init_runner, runner_specs
 Metrics = dict[str, Array]
 """Scalars to log, and the mean weight of each skill [K]."""
 
-Carry = tuple[LearnerState, Fleet, Array]
+Carry = tuple[LearnerState, ActorState, Array]
 """What goes from window to window: the learner, the robots, and which of them [N] have had a new
 task in this round."""
 
@@ -77,17 +77,17 @@ def train_round(
     epsilon = own_shard(epsilon, axis_name)
     env_params = own_worlds(env_params, config.randomization, config.num_envs, axis_name)
     start_keys = own_shard(jax.random.split(start_key, config.num_envs), axis_name)
-    actors = start_fleet(start_keys, program.network, env_params)
+    actors = start_actors(start_keys, env_params, program.network)
     has_restarted = jnp.zeros(epsilon.shape, bool)
 
-    def one_window(carry: Carry, key: Array) -> tuple[Carry, tuple[Trace, Metrics]]:
+    def one_window(carry: Carry, key: Array) -> tuple[Carry, tuple[Trajectory, Metrics]]:
         return rollout_and_learn(key, carry, epsilon, env_params, program)
 
     window_keys = jax.random.split(window_key, program.num_windows)
-    (learner, *_), (traces, learning) = jax.lax.scan(
+    (learner, *_), (windows, learning) = jax.lax.scan(
         one_window, (runner.learner, actors, has_restarted), window_keys
     )
-    metrics = mean(_rollout_metrics(join_windows(traces), env_params), axis_name) | {
+    metrics = mean(_rollout_metrics(join_windows(windows), env_params), axis_name) | {
         "updates": learner.num_updates,
         "skipped_updates": learner.num_skipped,
         "finite": _is_finite(learner),
@@ -101,7 +101,7 @@ def train_round(
 
 def rollout_and_learn(
     key: Array, carry: Carry, epsilon: Array, env_params: EnvParams, program: Program
-) -> tuple[Carry, tuple[Trace, Metrics]]:
+) -> tuple[Carry, tuple[Trajectory, Metrics]]:
     """One window: roll it out, learn from it, and send robots that have arrived to new goals.
 
     To the learner a new task is a truncation, as the end of every window is one: it has already
@@ -110,31 +110,32 @@ def rollout_and_learn(
     learner, actors, has_restarted = carry
     config, axis_name = program.config, program.axis_name
     unroll_key, learn_key, restart_key = jax.random.split(key, 3)
-    draws = draw_chance(unroll_key, program.window_length, config.num_envs)
+    draws = random_draws(unroll_key, program.window_length, config.num_envs)
     draws = own_shard(draws, axis_name, axis=1)
-    actors, trajectory, trace = unroll(
-        draws, program.network, learner.params, actors, epsilon, env_params
-    )
+    actors, trajectory = unroll(draws, learner.params, actors, epsilon, env_params, program.network)
     learner, metrics = LEARN[config.method](learn_key, learner, trajectory, program)
-    distances = jnp.where(has_restarted[None], jnp.inf, trace.goal_distances)
-    trace = dataclasses.replace(trace, goal_distances=distances)
+    distances = jnp.where(has_restarted[None], jnp.inf, trajectory.info["goal_distance"])
+    trajectory = dataclasses.replace(
+        trajectory.only("rewards", "poses", "goals", "output"),
+        info=trajectory.info | {"goal_distance": distances},
+    )
     if config.method == "pqn" and config.learner.restart_at_goal:
         restart_keys = own_shard(jax.random.split(restart_key, config.num_envs), axis_name)
-        actors, restarted = restart_at_goal(restart_keys, actors, program.network, env_params)
+        actors, restarted = restart_at_goal(restart_keys, actors, env_params, program.network)
         has_restarted |= restarted
-    return (learner, actors, has_restarted), (trace, metrics)
+    return (learner, actors, has_restarted), (trajectory, metrics)
 
 
-def _rollout_metrics(trace: Trace, env_params: EnvParams) -> Metrics:
+def _rollout_metrics(trajectory: Trajectory, env_params: EnvParams) -> Metrics:
     """Means over the robots of an episode."""
-    summary = summarize(trace, env_params.goal_radius)
+    episodes = episode_metrics(trajectory, env_params.goal_radius)
     return {
-        "mean_reward": summary.mean_reward.mean(),
-        "success": summary.success.mean(),
-        "time_steps": summary.time_steps.mean(),
-        "collisions": summary.collisions.mean(),
-        "covered_area": summary.covered_area.mean(),
-        "skill_usage": trace.skill_weights.mean(axis=(0, 1)),
+        "mean_reward": episodes.mean_reward.mean(),
+        "success": episodes.success.mean(),
+        "time_steps": episodes.time_steps.mean(),
+        "collisions": episodes.collisions.mean(),
+        "covered_area": episodes.covered_area.mean(),
+        "skill_usage": trajectory.output.skill_weights.mean(axis=(0, 1)),
     }
 
 

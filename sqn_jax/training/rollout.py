@@ -1,20 +1,20 @@
-"""The one place where simulator and agent meet: drive N robots for T steps."""
+"""The one place where simulator and agent meet: let N robots act for T steps."""
 
 from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.exploration import draw_exploration, epsilon_greedy
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.agent.shards import own_shard
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import RandomizationConfig
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
@@ -22,34 +22,12 @@ from sqn_jax.env.randomize import randomized, robot_axes, robots_own
 
 
 @struct.dataclass
-class Trace:
-    """What happened along T steps of N robots, beside what the learner needs; time-major."""
-
-    poses: Array
-    """[T + 1, N, 3] x m, y m, heading rad; the first is the start."""
-    goals: Array
-    """[N, 2] m."""
-    rewards: Array
-    """[T, N]."""
-    goal_distances: Array
-    """[T, N] line-of-sight distance after each step, m."""
-    collisions: Array
-    """[T, N] bool: the move was refused."""
-    covered_areas: Array
-    """[T, N] m2 newly seen in each step."""
-    skill_weights: Array
-    """[T, N, K] the skill decision of each step."""
-    skill_q_values: Array
-    """[T, N, K, A] action values of each skill, as the network puts them out."""
-
-
-@struct.dataclass
-class Fleet:
-    """N robots on their way: what an unroll starts from and leaves behind."""
+class ActorState:
+    """N robots within their episodes: what an unroll starts from and leaves behind."""
 
     obs: Observation
     """[N, ...] what they see now."""
-    state: EnvState
+    env_state: EnvState
     """[N, ...] where they are."""
     carry: Array
     """[N, H] recurrent state of their network."""
@@ -64,125 +42,156 @@ def own_worlds(
     return dataclasses.replace(worlds, **own)
 
 
-def start_fleet(keys: Array, network: QNetwork, env_params: EnvParams) -> Fleet:
+def start_actors(keys: Array, env_params: EnvParams, network: QNetwork) -> ActorState:
     """Start an episode for each of the keys [N], which are consumed."""
-    obs, state = jax.vmap(navigation.reset, in_axes=(0, robot_axes(env_params)))(keys, env_params)
-    return Fleet(obs=obs, state=state, carry=initial_carry(network.config, keys.shape[0]))
+    carry = initial_carry(network.config, keys.shape[0])
+    return ActorState(*reset_robots(keys, env_params), carry)
+
+
+def reset_robots(keys: Array, env_params: EnvParams) -> tuple[Observation, EnvState]:
+    """First observations and states [N, ...] of the episodes of keys [N], which are consumed."""
+    return jax.vmap(navigation.reset, in_axes=(0, robot_axes(env_params)))(keys, env_params)
 
 
 def restart_at_goal(
-    keys: Array, fleet: Fleet, network: QNetwork, env_params: EnvParams
-) -> tuple[Fleet, Array]:
+    keys: Array, actors: ActorState, env_params: EnvParams, network: QNetwork
+) -> tuple[ActorState, Array]:
     """Give every robot that stands within the goal radius a new task; the keys [N] are consumed.
 
     Returns:
-        The fleet, and which robots [N] have begun anew.
+        The robots, and which of them [N] have begun anew.
     """
-    away = fleet.state.goal - fleet.state.pose[:, :2]
+    away = actors.env_state.goal - actors.env_state.pose[:, :2]
     arrived = jnp.hypot(away[:, 0], away[:, 1]) < env_params.goal_radius
-    fresh = start_fleet(keys, network, env_params)
+    fresh = start_actors(keys, env_params, network)
 
     def choose(new: Array, old: Array) -> Array:
         return jnp.where(jnp.expand_dims(arrived, tuple(range(1, old.ndim))), new, old)
 
-    return jax.tree.map(choose, fresh, fleet), arrived
+    return jax.tree.map(choose, fresh, actors), arrived
 
 
-Chance = tuple[Array, Array, Array]
-"""All that is left to chance while N robots drive T steps, [T, N] each: coins and actions for
-exploration, and keys for the simulator's noise."""
+class RandomDraws(NamedTuple):
+    """All randomness of an unroll, [T, N] each."""
+
+    uniform: Array
+    """0..1, decides whether to explore."""
+    actions: Array
+    """int32, taken where a robot explores."""
+    step_keys: Array
+    """Keys for the simulator's noise."""
 
 
-def draw_chance(key: Array, num_steps: int, num_envs: int) -> Chance:
-    """Draw it for a whole unroll at once; the key is consumed."""
+def random_draws(key: Array, num_steps: int, num_envs: int) -> RandomDraws:
+    """Draw the randomness of a whole unroll at once; the key is consumed."""
     explore_key, noise_key = jax.random.split(key)
     shape = (num_steps, num_envs)
-    coins, random_actions = draw_exploration(explore_key, shape, navigation.NUM_ACTIONS)
-    return coins, random_actions, noise_keys(noise_key, *shape)
-
-
-def noise_keys(key: Array, num_steps: int, num_envs: int) -> Array:
-    """The keys [T, N] that an unroll hands to the simulator; the key is consumed."""
-    return jax.random.split(key, (num_steps, num_envs))
+    uniform, actions = draw_exploration(explore_key, shape, navigation.NUM_ACTIONS)
+    return RandomDraws(uniform, actions, jax.random.split(noise_key, shape))
 
 
 def unroll(
-    chance: Chance,
-    network: QNetwork,
+    draws: RandomDraws,
     params: Params,
-    fleet: Fleet,
+    actors: ActorState,
     epsilon: Array,
     env_params: EnvParams,
-) -> tuple[Fleet, Episodes, Trace]:
-    """Drive N robots for T steps, without reset.
+    network: QNetwork,
+) -> tuple[ActorState, Trajectory]:
+    """Let N robots act for T steps, without reset.
 
     Args:
-        chance: from `draw_chance`, consumed; lays down T and N.
-        network: the agent.
-        params: its parameters.
-        fleet: the robots.
+        draws: from `random_draws`, consumed; lays down T and N.
+        params: parameters of the network.
+        actors: the robots.
         epsilon: [N] probabilities of a random action; 0 is greedy.
         env_params: the world, or one for each robot (`env.randomize`).
+        network: the agent.
 
     Returns:
-        The robots afterwards, the steps for the learner, and the trace for statistics and
-        pictures.
+        The robots afterwards, and all that happened but for `covered`. In a compiled program what
+        nobody uses of it costs nothing.
     """
-    advance = partial(
-        act_and_step, network=network, params=params, epsilon=epsilon, env_params=env_params
-    )
-    last, (observations, poses, actions, results, outputs) = jax.lax.scan(advance, fleet, chance)
-    reward, terminated, info = results
-    episodes = Episodes(
-        obs=jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), observations, last.obs),
-        actions=actions,
-        rewards=reward,
-        terminated=terminated,
-        carry=fleet.carry,
-    )
-    trace = Trace(
-        poses=jnp.concatenate([poses, last.state.pose[None]]),
-        goals=fleet.state.goal,
-        rewards=reward,
-        goal_distances=info["goal_distance"],
-        collisions=info["collision"],
-        covered_areas=info["covered_area"],
-        skill_weights=outputs.skill_weights,
-        skill_q_values=outputs.skill_q_values,
-    )
-    return last, episodes, trace
+    body = partial(_act_and_step, params=params, epsilon=epsilon, env_params=env_params)
+    last, steps = jax.lax.scan(partial(body, network=network), actors, draws)
+    return last, with_ends(steps, actors, last)
 
 
-def act_and_step(
-    fleet: Fleet,
-    chance: Chance,
+def _act_and_step(
+    actors: ActorState,
+    draws: RandomDraws,
     *,
-    network: QNetwork,
     params: Params,
     epsilon: Array,
     env_params: EnvParams,
-) -> tuple[Fleet, tuple[Any, ...]]:
-    """One step of all robots: Q-values, action, simulator."""
-    coins, random_actions, step_keys = chance
-    carry, output = network.apply(params, jax.tree.map(lambda x: x[None], fleet.obs), fleet.carry)
+    network: QNetwork,
+) -> tuple[ActorState, Trajectory]:
+    """One step of all robots: action values, action, simulator."""
+    obs = jax.tree.map(lambda x: x[None], actors.obs)
+    carry, output = network.apply(params, obs, actors.carry)
     output = jax.tree.map(lambda x: x[0], output)
-    action = epsilon_greedy(output.q_values, epsilon, coins, random_actions)
+    actions = epsilon_greedy(output.q_values, epsilon, draws.uniform, draws.actions)
+    actors, step = step_actors(draws.step_keys, actors, actions, env_params)
+    return dataclasses.replace(actors, carry=carry), dataclasses.replace(step, output=output)
+
+
+def step_actors(
+    step_keys: Array, actors: ActorState, actions: Array, env_params: EnvParams
+) -> tuple[ActorState, Trajectory]:
+    """Advance N robots by actions [N], whoever chose them; the keys [N] are consumed.
+
+    Returns:
+        The robots, their carry as it was, and the step: a trajectory without the axis of time, of
+        which `with_ends` makes a whole one.
+    """
     step = jax.vmap(navigation.step, in_axes=(0, 0, 0, robot_axes(env_params)))
-    obs, state, reward, terminated, _, info = step(step_keys, fleet.state, action, env_params)
-    emitted = (fleet.obs, fleet.state.pose, action, (reward, terminated, info), output)
-    return Fleet(obs=obs, state=state, carry=carry), emitted
+    obs, env_state, rewards, terminated, _, info = step(
+        step_keys, actors.env_state, actions, env_params
+    )
+    taken = Trajectory(
+        obs=actors.obs,
+        actions=actions,
+        rewards=rewards,
+        terminated=terminated,
+        poses=actors.env_state.pose,
+        info=info,
+    )
+    return dataclasses.replace(actors, obs=obs, env_state=env_state), taken
 
 
-def join_windows(traces: Trace) -> Trace:
-    """One trace of an episode out of its windows, stacked [W, T / W, N, ...]."""
-    moves = dataclasses.replace(traces, poses=traces.poses[:, 1:])
+def with_ends(steps: Trajectory, first: ActorState, last: ActorState) -> Trajectory:
+    """Steps from `step_actors`, stacked, with what was before the first and after the last.
+
+    Args:
+        steps: [T, N, ...]; `obs` may be left out.
+        first: the robots before them.
+        last: the robots after them.
+    """
+
+    def append(array: Array, end: Array) -> Array:
+        return jnp.concatenate([array, end[None]])
+
+    return dataclasses.replace(
+        steps,
+        obs=None if steps.obs is None else jax.tree.map(append, steps.obs, last.obs),
+        poses=append(steps.poses, last.env_state.pose),
+        carry=first.carry,
+        goals=first.env_state.goal,
+    )
+
+
+def join_windows(windows: Trajectory) -> Trajectory:
+    """What `episode_metrics` needs of an episode out of its windows, stacked [W, T / W, N, ...]."""
+    moves = dataclasses.replace(
+        windows.only("rewards", "info", "output"), poses=windows.poses[:, 1:]
+    )
     joined = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
-    poses = jnp.concatenate([traces.poses[0, :1], joined.poses])
-    return dataclasses.replace(joined, poses=poses, goals=traces.goals[0])
+    poses = jnp.concatenate([windows.poses[0, :1], joined.poses])
+    return dataclasses.replace(joined, poses=poses, goals=windows.goals[0])
 
 
 @struct.dataclass
-class EpisodeSummary:
+class EpisodeMetrics:
     """One number an episode, [N] each."""
 
     success: Array
@@ -196,27 +205,32 @@ class EpisodeSummary:
     covered_area: Array
     """m2 seen beyond the first scan."""
     path_length: Array
-    """m driven up to the first entry, or in the whole episode for a failure."""
+    """m traveled up to the first entry, or in the whole episode for a failure."""
 
 
-def summarize(trace: Trace, goal_radius: Array) -> EpisodeSummary:
+def episode_metrics(trajectory: Trajectory, goal_radius: Array) -> EpisodeMetrics:
     """Reduce whole episodes to one number each.
 
     Success counts from the first step on; a robot that starts within the radius has it at step 1
     at the latest if it stays.
+
+    Args:
+        trajectory: with `rewards`, `poses` and `info`.
+        goal_radius: m.
     """
-    length = trace.goal_distances.shape[0]
-    inside = trace.goal_distances < goal_radius
+    info = trajectory.info
+    length = trajectory.rewards.shape[0]
+    inside = info["goal_distance"] < goal_radius
     success = inside.any(axis=0)
     time_steps = jnp.where(success, jnp.argmax(inside, axis=0) + 1, length).astype(jnp.int32)
-    moves = jnp.diff(trace.poses[..., :2], axis=0)
-    driven = jnp.hypot(moves[..., 0], moves[..., 1])
+    moves = jnp.diff(trajectory.poses[..., :2], axis=0)
+    traveled = jnp.hypot(moves[..., 0], moves[..., 1])
     counted = jnp.arange(length)[:, None] < time_steps[None]
-    return EpisodeSummary(
+    return EpisodeMetrics(
         success=success,
         time_steps=time_steps,
-        mean_reward=trace.rewards.mean(axis=0),
-        collisions=trace.collisions.sum(axis=0, dtype=jnp.int32),
-        covered_area=trace.covered_areas.sum(axis=0),
-        path_length=jnp.where(counted, driven, 0.0).sum(axis=0),
+        mean_reward=trajectory.rewards.mean(axis=0),
+        collisions=info["collision"].sum(axis=0, dtype=jnp.int32),
+        covered_area=info["covered_area"].sum(axis=0),
+        path_length=jnp.where(counted, traveled, 0.0).sum(axis=0),
     )

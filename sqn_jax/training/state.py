@@ -11,16 +11,16 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from sqn_jax.agent import r2d2, replay
-from sqn_jax.agent.experience import Episodes
 from sqn_jax.agent.learner import LearnerState, init_learner
-from sqn_jax.agent.networks import Params, initial_carry, make_network
+from sqn_jax.agent.networks import Params, QNetwork, initial_carry, make_network
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shards import AXIS
+from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams, Observation
 from sqn_jax.training.devices import REPLICATED
-from sqn_jax.training.rollout import draw_chance, start_fleet, unroll
+from sqn_jax.training.rollout import random_draws, start_actors, unroll
 
 
 @struct.dataclass
@@ -52,27 +52,32 @@ def example_obs(config: EnvConfig) -> Observation:
     )
 
 
+def network_of(config: TrainConfig) -> QNetwork:
+    """The network that a run trains."""
+    return make_network(config.algo, config.network, NUM_ACTIONS)
+
+
 def params_shapes(config: TrainConfig) -> Params:
     """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
 
     They follow from the config alone: the map need not be at hand.
     """
-    network = make_network(config.algo, config.network, NUM_ACTIONS)
     obs, carry = example_obs(config.env), initial_carry(config.network, 1)
-    shapes = jax.eval_shape(network.init, jax.random.key(0), obs, carry)
+    shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
     seeds = () if config.num_seeds == 1 else (config.num_seeds,)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)
 
 
-def trajectory_shapes(env_params: EnvParams, program: Program) -> Episodes:
+def trajectory_shapes(env_params: EnvParams, program: Program) -> Trajectory:
     """Shapes and dtypes of what `learn` is given, without computing anything."""
     network, num_envs = program.network, program.config.num_envs
 
-    def one_unroll(key: Array) -> Episodes:
-        actors = start_fleet(jax.random.split(key, num_envs), network, env_params)
+    def one_unroll(key: Array) -> Trajectory:
+        actors = start_actors(jax.random.split(key, num_envs), env_params, network)
         params = network.init(key, jax.tree.map(lambda x: x[None], actors.obs), actors.carry)
-        draws = draw_chance(key, program.window_length, num_envs)
-        return unroll(draws, network, params, actors, jnp.zeros(num_envs), env_params)[1]
+        draws = random_draws(key, program.window_length, num_envs)
+        epsilon = jnp.zeros(num_envs)
+        return unroll(draws, params, actors, epsilon, env_params, network)[1].for_learning()
 
     return jax.eval_shape(one_unroll, jax.random.key(0))
 

@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 from learning_oracle import Batch
 
-from sqn_jax.agent import Episodes, QNetwork, make_network
+from sqn_jax.agent import QNetwork, Trajectory, make_network
 from sqn_jax.config import NetworkConfig
 
 NUM_ACTIONS = 3
@@ -58,9 +58,9 @@ def random_params(network: QNetwork, rng: np.random.Generator, obs: Any = None) 
 
 def random_episodes(
     rng: np.random.Generator, length: int, batch: int, *, terminated: float = 0.0
-) -> Episodes:
+) -> Trajectory:
     """Steps that end truly with the given chance, driven with a recurrent state in mid-way."""
-    return Episodes(
+    return Trajectory(
         obs=random_obs(rng, length + 1, batch),
         actions=jnp.asarray(rng.integers(0, NUM_ACTIONS, (length, batch)), jnp.int32),
         rewards=jnp.asarray(rng.normal(size=(length, batch)), jnp.float32),
@@ -69,9 +69,9 @@ def random_episodes(
     )
 
 
-def of_robots(episodes: Episodes, robots: Any) -> Episodes:
+def of_robots(episodes: Trajectory, robots: Any) -> Trajectory:
     """The episodes of some robots only, field by field."""
-    return Episodes(
+    return Trajectory(
         obs=Seen(episodes.obs.ranges[:, robots], episodes.obs.goal[:, robots]),
         actions=episodes.actions[:, robots],
         rewards=episodes.rewards[:, robots],
@@ -85,7 +85,7 @@ def in_float64(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x, np.float64), tree)
 
 
-def as_batch(episodes: Episodes) -> Batch:
+def as_batch(episodes: Trajectory) -> Batch:
     return Batch(
         ranges=np.asarray(episodes.obs.ranges, np.float64),
         goal=np.asarray(episodes.obs.goal, np.float64),

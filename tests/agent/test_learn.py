@@ -20,7 +20,7 @@ from small_problems import (
     small_network,
 )
 
-from sqn_jax.agent import Episodes, pqn, r2d2, replay
+from sqn_jax.agent import Trajectory, pqn, r2d2, replay
 from sqn_jax.agent.learner import LearnerState, discount_schedule
 from sqn_jax.agent.loss import pqn_loss, r2d2_loss
 from sqn_jax.agent.program import Program, make_optimizer
@@ -190,7 +190,7 @@ def test_pqn_sees_every_episode_equally_often(
     episodes = random_episodes(np.random.default_rng(33), LENGTH, 6)
     seen: list[list[int]] = []
 
-    def note_robots(params: Any, part: Episodes, *_: Any) -> None:
+    def note_robots(params: Any, part: Trajectory, *_: Any) -> None:
         assert part.obs.ranges.shape[:2] == (LENGTH + 1, batch_size)
         # Rewards are random, so that they tell which robot's they are.
         same = np.asarray(part.rewards[:, :, None] == episodes.rewards[:, None]).all(axis=0)

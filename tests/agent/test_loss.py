@@ -19,7 +19,7 @@ from small_problems import (
     small_network,
 )
 
-from sqn_jax.agent import Episodes
+from sqn_jax.agent import Trajectory
 from sqn_jax.agent.loss import gate_entropy, pqn_loss, r2d2_loss, skill_distance
 from sqn_jax.agent.program import Program
 from sqn_jax.config import LearnerConfig, TrainConfig
@@ -45,7 +45,7 @@ class Problem:
     network: Any
     params: Any
     target_params: Any
-    episodes: Episodes
+    episodes: Trajectory
 
     def program(self, config: LearnerConfig) -> Program:
         settings = TrainConfig(algo=self.algo, network=self.network.config, learner=config)
@@ -270,7 +270,7 @@ def test_what_was_done_and_earned_in_burn_in_does_not_matter() -> None:
 def test_the_last_observation_counts_at_a_time_limit_and_not_after_a_true_end(method: str) -> None:
     given = problem("sqn", layer_norm=method == "pqn")
 
-    def last_errors(episodes: Episodes) -> np.ndarray:
+    def last_errors(episodes: Trajectory) -> np.ndarray:
         each = dataclasses.replace(given, episodes=episodes)
         if method == "r2d2":
             output = r2d2(each, CONFIG)[1]

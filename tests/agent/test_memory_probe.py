@@ -13,7 +13,7 @@ import pytest
 from jax import Array
 from small_problems import Seen, random_params
 
-from sqn_jax.agent import Episodes, initial_carry, pqn, r2d2
+from sqn_jax.agent import Trajectory, initial_carry, pqn, r2d2
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.program import Program
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
@@ -32,14 +32,14 @@ def observations(lamps: Array) -> Seen:
     return Seen(ranges=shown.astype(jnp.float32), goal=clock.astype(jnp.float32))
 
 
-def random_round(key: Array) -> Episodes:
+def random_round(key: Array) -> Trajectory:
     """Episodes of robots that act at random: which is enough to learn what would be right."""
     lamp_key, action_key = jax.random.split(key)
     lamps = jax.random.randint(lamp_key, (NUM_ROBOTS,), 0, 2)
     actions = jax.random.randint(action_key, (LENGTH, NUM_ROBOTS), 0, 2)
     asked = (jnp.arange(LENGTH) == ASKED_STEP)[:, None]
     earned = jnp.where(actions == lamps[None], 1.0, -1.0)
-    return Episodes(
+    return Trajectory(
         obs=observations(lamps),
         actions=actions,
         rewards=jnp.where(asked, earned, 0.0),

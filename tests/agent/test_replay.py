@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from small_problems import HIDDEN, Seen, random_episodes
 
-from sqn_jax.agent import Episodes, r2d2, replay
+from sqn_jax.agent import Trajectory, r2d2, replay
 
 add = jax.jit(replay.add)
 sample = jax.jit(
@@ -227,7 +227,7 @@ def test_the_replay_of_the_paper_takes_less_than_half_a_gigabyte() -> None:
     def shape(*sizes: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(sizes, dtype)
 
-    episodes = Episodes(
+    episodes = Trajectory(
         obs=Seen(ranges=shape(401, 50, 71), goal=shape(401, 50, 2)),
         actions=shape(400, 50, dtype=jnp.int32),
         rewards=shape(400, 50),

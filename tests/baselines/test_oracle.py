@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +19,8 @@ from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import EnvParams, make_env, reset, reset_to, step
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
-from sqn_jax.evaluation.baseline_episodes import drive, run_bug, run_oracle
+from sqn_jax.evaluation import baseline_episodes
+from sqn_jax.evaluation.baseline_episodes import run_baseline
 from sqn_jax.evaluation.episodes import episode_keys, run_episodes
 from sqn_jax.evaluation.statistics import success_weighted_path_length
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
@@ -61,9 +61,20 @@ def maze() -> tuple[OccupancyMap, EnvParams]:
     return maze, make_env(maze)
 
 
+def run_oracle(occupancy_map: OccupancyMap, world: EnvParams, num_episodes: int) -> Any:
+    """Metrics and trajectory of the oracle's episodes."""
+    (metrics,), trajectory = run_baseline(
+        episode_keys(KEY, num_episodes),
+        baseline_episodes.oracle(occupancy_map, world),
+        world,
+        fields=("poses", "goals", "output"),
+    )
+    return metrics, trajectory
+
+
 @pytest.fixture(scope="module")
 def maze_episodes(maze: tuple[OccupancyMap, EnvParams]) -> Any:
-    return run_oracle(KEY, *maze, 60)
+    return run_oracle(*maze, 60)
 
 
 def test_starts_goals_and_noise_are_those_of_run_episodes() -> None:
@@ -75,44 +86,51 @@ def test_starts_goals_and_noise_are_those_of_run_episodes() -> None:
     # A network of zeros values all actions alike and so takes the first: it stands still.
     params = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     keys = episode_keys(KEY, 4)
-    (summary,), trace = run_episodes(keys, params, world, algo="sqn", network_config=config)
-    ours, our_trace = drive(keys, world, lambda obs, state: np.full(4, STAND))
-    np.testing.assert_array_equal(our_trace.poses[0], trace.poses[0])
-    np.testing.assert_array_equal(our_trace.goals, trace.goals)
+    fields = ("obs", "actions", "rewards", "terminated", "poses", "goals", "info", "output")
+    (metrics,), theirs = run_episodes(keys, params, world, network, fields=fields)
+    (our_metrics,), ours = run_baseline(
+        keys, lambda obs, state: np.full(4, STAND), world, fields=fields
+    )
+    np.testing.assert_array_equal(ours.poses[0], theirs.poses[0])
+    np.testing.assert_array_equal(ours.goals, theirs.goals)
     # Two programs may round differently; another noise would be off by centimetres.
-    np.testing.assert_allclose(our_trace.poses, trace.poses, atol=1e-4)
-    assert np.abs(np.diff(trace.poses[..., :2], axis=0)).max() > 0.01
-    for name in ("rewards", "goal_distances", "covered_areas"):
-        np.testing.assert_allclose(getattr(our_trace, name), getattr(trace, name), atol=1e-3)
-    assert {f.name: np.shape(getattr(ours, f.name)) for f in dataclasses.fields(ours)} == {
-        f.name: np.shape(getattr(summary, f.name)) for f in dataclasses.fields(summary)
-    }
-    _, oracle_trace = run_oracle(KEY, small, world, 4)
-    np.testing.assert_array_equal(oracle_trace.poses[0], trace.poses[0])
-    np.testing.assert_array_equal(oracle_trace.goals, trace.goals)
+    np.testing.assert_allclose(ours.poses, theirs.poses, atol=1e-4)
+    assert np.abs(np.diff(theirs.poses[..., :2], axis=0)).max() > 0.01
+    for name in ("obs", "actions", "rewards", "terminated", "info"):
+        ours_of_name, theirs_of_name = getattr(ours, name), getattr(theirs, name)
+        assert jax.tree.structure(ours_of_name) == jax.tree.structure(theirs_of_name)
+        for one, other in zip(
+            jax.tree.leaves(ours_of_name), jax.tree.leaves(theirs_of_name), strict=True
+        ):
+            assert one.dtype == other.dtype
+            np.testing.assert_allclose(one, other, atol=1e-3)
+    assert jax.tree.map(np.shape, our_metrics) == jax.tree.map(np.shape, metrics)
+    _, of_oracle = run_oracle(small, world, 4)
+    np.testing.assert_array_equal(of_oracle.poses[0], theirs.poses[0])
+    np.testing.assert_array_equal(of_oracle.goals, theirs.goals)
 
 
 def test_oracle_reaches_every_goal_of_the_maze_without_a_collision(maze_episodes: Any) -> None:
-    summary, trace = maze_episodes
-    assert summary.success.all()
-    assert not summary.collisions.any()
-    assert trace.poses.shape == (401, 60, 3)
-    assert trace.skill_weights.shape == (400, 60, 1)
+    metrics, trajectory = maze_episodes
+    assert metrics.success.all()
+    assert not metrics.collisions.any()
+    assert trajectory.poses.shape == (401, 60, 3)
+    assert trajectory.output.skill_weights.shape == (400, 60, 1)
 
 
 def test_oracle_stands_still_at_the_goal(maze_episodes: Any) -> None:
-    summary, trace = maze_episodes
-    for robot, arrival in enumerate(summary.time_steps):
-        rest = trace.poses[arrival:, robot]
+    metrics, trajectory = maze_episodes
+    for robot, arrival in enumerate(metrics.time_steps):
+        rest = trajectory.poses[arrival:, robot]
         assert (rest == rest[0]).all()
 
 
 def test_oracle_steps_lie_near_the_lattice_and_above_the_geodesic(
     maze: tuple[OccupancyMap, EnvParams], maze_episodes: Any
 ) -> None:
-    summary, trace = maze_episodes
+    metrics, trajectory = maze_episodes
     count = 10
-    goals, starts = trace.goals[:count], trace.poses[0, :count]
+    goals, starts = trajectory.goals[:count], trajectory.poses[0, :count]
     rows, cols = points_to_cells(starts[:, :2], maze[0].resolution).T
     heading = np.round(starts[:, 2] * HEADINGS / (2 * np.pi)).astype(int) % HEADINGS
     lattice = np.array(
@@ -121,7 +139,7 @@ def test_oracle_steps_lie_near_the_lattice_and_above_the_geodesic(
             for goal, row, col, h in zip(goals, rows, cols, heading, strict=True)
         ]
     )
-    ours = summary.time_steps[:count]
+    ours = metrics.time_steps[:count]
     # The lattice rounds headings and moves, so that one way can differ by some steps.
     assert abs(ours.mean() / lattice.mean() - 1) < 0.04
     assert np.abs(ours - lattice).max() <= 6
@@ -135,13 +153,14 @@ def test_oracle_drives_all_evaluation_pairs_of_the_maze(
     maze: tuple[OccupancyMap, EnvParams],
 ) -> None:
     world = make_env(maze[0], spawn="evaluation")
-    summary, trace = run_oracle(KEY, maze[0], world, 60)
+    metrics, trajectory = run_oracle(maze[0], world, 60)
+    starts = trajectory.poses[0, :, :2]
     pairs = {
         (*start, *goal)
-        for start, goal in zip(trace.poses[0, :, :2].round(2), trace.goals.round(2), strict=True)
+        for start, goal in zip(starts.round(2), trajectory.goals.round(2), strict=True)
     }
     assert len(pairs) == 12
-    assert summary.success.all()
+    assert metrics.success.all()
 
 
 @pytest.mark.parametrize(
@@ -237,9 +256,9 @@ def test_ways_know_distance_direction_and_bends() -> None:
 
 def test_oracle_mends_its_plan_under_noise() -> None:
     small, world = small_room(velocity_noise=0.2)
-    summary, _ = run_oracle(KEY, small, world, 12)
-    assert summary.success.all()
-    assert summary.time_steps.mean() < 45
+    metrics, _ = run_oracle(small, world, 12)
+    assert metrics.success.all()
+    assert metrics.time_steps.mean() < 45
 
 
 def test_a_refused_move_is_not_tried_again() -> None:
@@ -259,7 +278,7 @@ def test_oracle_refuses_another_map_and_a_robot_that_cannot_turn() -> None:
     small, world = small_room()
     other = room(5, 6, [(1, 1), (5, 4)])
     with pytest.raises(ValueError, match=r"has \(100, 120\) cells, expected \(80, 120\)"):
-        run_oracle(KEY, other, world, 1)
+        run_oracle(other, world, 1)
     fixed = make_env(small, EnvConfig(turn_rate=0.0))
     with pytest.raises(ValueError, match="cannot drive or turn"):
         Oracle(small, fixed, np.array([[5.025, 2.025]]))
@@ -269,37 +288,41 @@ def test_oracle_refuses_another_map_and_a_robot_that_cannot_turn() -> None:
 
 def bug_in(points: Any, *walls: tuple[float, float, float, float]) -> Any:
     """Eight episodes between two points of a room of 8 x 16 m; all such rooms compile once."""
-    return run_bug(KEY, make_env(room(8, 16, points, *walls), spawn="evaluation"), 8)
+    world = make_env(room(8, 16, points, *walls), spawn="evaluation")
+    (metrics,), trajectory = run_baseline(
+        episode_keys(KEY, 8), baseline_episodes.bug(world, 8), world
+    )
+    return metrics, trajectory
 
 
 def test_bug_drives_straight_at_a_goal_in_the_open() -> None:
-    summary, _ = bug_in([(1.025, 1.025), (8.025, 5.025)])
-    assert summary.success.all()
-    assert not summary.collisions.any()
+    metrics, _ = bug_in([(1.025, 1.025), (8.025, 5.025)])
+    assert metrics.success.all()
+    assert not metrics.collisions.any()
     distance = np.hypot(7, 4)
     # Up to ten turns at first; a heading is off by up to 9 degrees and corrected on the way.
-    assert summary.time_steps.min() >= (distance - 0.3) / 0.25
-    assert summary.time_steps.max() <= distance / 0.25 + 10 + 6
+    assert metrics.time_steps.min() >= (distance - 0.3) / 0.25
+    assert metrics.time_steps.max() <= distance / 0.25 + 10 + 6
 
 
 def test_bug_gets_round_a_wall() -> None:
-    summary, _ = bug_in([(4.025, 4.025), (11.025, 4.025)], (7.4, 7.6, 2.0, 6.0))
-    assert summary.success.all()
-    assert not summary.collisions.any()
+    metrics, _ = bug_in([(4.025, 4.025), (11.025, 4.025)], (7.4, 7.6, 2.0, 6.0))
+    assert metrics.success.all()
+    assert not metrics.collisions.any()
     # By either end of the wall 8.1 m.
-    assert summary.time_steps.max() <= 1.5 * 8.1 / 0.25
+    assert metrics.time_steps.max() <= 1.5 * 8.1 / 0.25
 
 
 def test_bug_gets_out_of_a_trap() -> None:
     # Open to the left; from the left point straight into the trap, from the right point behind it.
     trap = [(6.0, 10.0, 2.0, 2.2), (6.0, 10.0, 6.0, 6.2), (9.8, 10.0, 2.0, 6.2)]
-    summary, trace = bug_in([(7.025, 4.025), (12.525, 4.025)], *trap)
-    inside = trace.poses[0, :, 0] < 9
+    metrics, trajectory = bug_in([(7.025, 4.025), (12.525, 4.025)], *trap)
+    inside = trajectory.poses[0, :, 0] < 9
     assert inside.any()
     assert not inside.all()
-    assert summary.success.all()
-    assert not summary.collisions.any()
-    assert summary.time_steps.max() <= 200
+    assert metrics.success.all()
+    assert not metrics.collisions.any()
+    assert metrics.time_steps.max() <= 200
 
 
 def test_bug_does_not_see_beyond_its_beams() -> None:

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from sqn_jax.evaluation.agents import EpisodeBatch
 from sqn_jax.evaluation.scores import (
-    Outcome,
     describe,
     improvement,
     markdown_table,
     records,
     results_table,
 )
-from sqn_jax.training.rollout import EpisodeSummary
+from sqn_jax.training.rollout import EpisodeMetrics
+
+RADIUS = 0.3
 
 
-def outcome(
+def batch(
     training_seed: int | None, eval_seed: int, success: list[bool], **changes: Any
-) -> Outcome:
+) -> EpisodeBatch:
     count = len(success)
     reached = np.array(success)
     fields = {
@@ -32,13 +35,20 @@ def outcome(
         "path_length": np.full(count, 8.0),
         **changes,
     }
-    starts, goals = np.zeros((count, 3)), np.ones((count, 2))
-    shortest = np.full(count, 6.0)
-    return Outcome(training_seed, eval_seed, EpisodeSummary(**fields), starts, goals, shortest)
+    return EpisodeBatch(
+        agent=cast(Any, None),
+        world=cast(Any, None),
+        training_seed=training_seed,
+        eval_seed=eval_seed,
+        metrics={RADIUS: EpisodeMetrics(**fields)},
+        starts=np.zeros((count, 3)),
+        goals=np.ones((count, 2)),
+        shortest_paths=np.full(count, 6.0),
+    )
 
 
 def test_failures_count_at_the_limit_and_are_left_out_of_the_successes() -> None:
-    told = describe([outcome(0, 1000, [True, False, True, True])])
+    told = describe([batch(0, 1000, [True, False, True, True])], RADIUS)
     assert told["success"]["mean"] == 0.75
     assert told["time_steps"]["mean"] == (10 + 400 + 30 + 40) / 4
     assert told["time_steps_success"]["mean"] == (10 + 30 + 40) / 3
@@ -52,26 +62,27 @@ def test_failures_count_at_the_limit_and_are_left_out_of_the_successes() -> None
 def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> None:
     """Evaluation seeds are told apart, training seeds meet the same oracle."""
     ours = [
-        outcome(0, 1000, [True, False, True, True]),
-        outcome(1, 1000, [True, True, False, False]),
-        outcome(0, 1001, [True, True, False, False]),
+        batch(0, 1000, [True, False, True, True]),
+        batch(1, 1000, [True, True, False, False]),
+        batch(0, 1001, [True, True, False, False]),
     ]
     oracle = [
-        outcome(None, 1001, [True, False, True, True], time_steps=np.array([8, 400, 9, 9])),
-        outcome(None, 1000, [True, True, True, True], time_steps=np.array([5, 10, 20, 40])),
+        batch(None, 1001, [True, False, True, True], time_steps=np.array([8, 400, 9, 9])),
+        batch(None, 1000, [True, True, True, True], time_steps=np.array([5, 10, 20, 40])),
     ]
-    told = describe(ours, oracle)["steps_over_oracle"]
+    told = describe(ours, RADIUS, oracle)["steps_over_oracle"]
     expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
     assert told["mean"] == pytest.approx(np.mean(expected))
     assert told["std"] == pytest.approx(np.std(expected))
-    assert describe(ours)["steps_over_oracle"] is None
-    nowhere = outcome(0, 1000, [False] * 4)
-    assert describe([nowhere], oracle)["steps_over_oracle"] is None
+    assert describe(ours, RADIUS)["steps_over_oracle"] is None
+    nowhere = batch(0, 1000, [False] * 4)
+    assert describe([nowhere], RADIUS, oracle)["steps_over_oracle"] is None
 
 
 def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> None:
     told = describe(
-        [outcome(0, 1000, [True, True, True, True]), outcome(0, 1001, [True, False, False, True])]
+        [batch(0, 1000, [True, True, True, True]), batch(0, 1001, [True, False, False, True])],
+        RADIUS,
     )
     assert told["success"]["mean"] == 0.75
     assert told["success"]["std_of_means"] == 0.25
@@ -80,7 +91,7 @@ def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> No
 
 def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
     rates = ([True, True], [True, False], [False, False], [True, True])
-    told = describe([outcome(seed, 1000, rate) for seed, rate in enumerate(rates)])
+    told = describe([batch(seed, 1000, rate) for seed, rate in enumerate(rates)], RADIUS)
     assert told["success_per_seed"] == [1.0, 0.5, 0.0, 1.0]
     assert told["success"]["iqm"] == pytest.approx((0.5 + 1.0) / 2)
     low, high = told["success"]["iqm_ci95"]
@@ -88,25 +99,25 @@ def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
 
 
 def test_no_success_and_no_shortest_way_are_said_and_not_made_up() -> None:
-    lost = outcome(None, 1000, [False, False])
-    blind = Outcome(None, 1000, lost.summary, lost.starts, lost.goals, None)
-    told = describe([blind])
+    lost = batch(None, 1000, [False, False])
+    blind = dataclasses.replace(lost, shortest_paths=None)
+    told = describe([blind], RADIUS)
     assert told["time_steps_success"] is None
     assert told["spl"] is None
 
 
 def test_improvement_needs_several_training_seeds_of_both() -> None:
-    good = [[outcome(seed, 1000, [True, True]) for seed in range(3)]]
-    bad = [[outcome(seed, 1000, [seed == 0, False]) for seed in range(3)]]
-    told = improvement(good, bad)
+    good = [[batch(seed, 1000, [True, True]) for seed in range(3)]]
+    bad = [[batch(seed, 1000, [seed == 0, False]) for seed in range(3)]]
+    told = improvement(good, bad, RADIUS)
     assert told["probability"] == 1.0
-    assert improvement(bad, good)["probability"] == 0.0
-    assert improvement(good, good)["probability"] == 0.5
-    assert improvement(good, [[outcome(None, 1000, [True, True])]]) is None
+    assert improvement(bad, good, RADIUS)["probability"] == 0.0
+    assert improvement(good, good, RADIUS)["probability"] == 0.5
+    assert improvement(good, [[batch(None, 1000, [True, True])]], RADIUS) is None
 
 
 def test_a_record_says_what_an_episode_was_and_came_to() -> None:
-    rows = list(records([outcome(3, 1001, [False, True])], map="maze", agent="sqn"))
+    rows = list(records([batch(3, 1001, [False, True])], RADIUS, map="maze", agent="sqn"))
     assert len(rows) == 2
     assert rows[1] == {
         "map": "maze",
@@ -139,7 +150,7 @@ def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> Non
                 {
                     **{"map": "maze", "agent": "sqn", "tasks": "evaluation points"},
                     **{"velocity_noise": noise, "range_noise": 0.0, "goal_radius": radius},
-                    **describe([outcome(0, 1000, success)]),
+                    **describe([batch(0, 1000, success)], RADIUS),
                 }
             )
     header, _, quiet, noisy = results_table(entries).splitlines()

@@ -16,7 +16,7 @@ import pytest
 from compiling import compiling_quickly
 
 from experiments import operations
-from sqn_jax.agent import Episodes, gru, linear, make_network, networks, r2d2, replay
+from sqn_jax.agent import Trajectory, gru, linear, make_network, networks, r2d2, replay
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.program import Program
@@ -29,9 +29,9 @@ LEARNER = LearnerConfig(burn_in_length=3, n_step=2, discount=0.9, max_grad_norm=
 PRIORITY_WEIGHT = 0.9
 
 
-def random_batch(rng: np.random.Generator) -> tuple[Episodes, jax.Array]:
+def random_batch(rng: np.random.Generator) -> tuple[Trajectory, jax.Array]:
     """Episodes with true ends and a recurrent state at their start, and weights."""
-    episodes = Episodes(
+    episodes = Trajectory(
         obs=Observation(
             ranges=jnp.asarray(rng.random((LENGTH + 1, BATCH, BEAMS)), jnp.float32),
             goal=jnp.asarray(rng.random((LENGTH + 1, BATCH, 2)), jnp.float32),
@@ -44,7 +44,7 @@ def random_batch(rng: np.random.Generator) -> tuple[Episodes, jax.Array]:
     return episodes, jnp.asarray(rng.uniform(0.2, 1.0, BATCH), jnp.float32)
 
 
-def random_params(rng: np.random.Generator, algo: str, episodes: Episodes) -> Any:
+def random_params(rng: np.random.Generator, algo: str, episodes: Trajectory) -> Any:
     """Every parameter random, those too that start at zero."""
     network = make_network(algo, SIZES, ACTIONS)
     shapes = jax.eval_shape(network.init, jax.random.key(0), episodes.obs, episodes.carry)

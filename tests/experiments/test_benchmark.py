@@ -148,7 +148,7 @@ def test_the_breakdown_tells_of_every_piece_and_of_both_halves_of_a_window() -> 
         entries = bench_breakdown.measure(config, small_room(30), 5, 2)
     assert [entry["piece"] for entry in entries] == [
         *bench_breakdown.PIECES,
-        *("drive a window", "learn from a window"),
+        *("roll out a window", "learn from a window"),
     ]
     for entry in entries:
         assert 0 < entry["fastest"] <= entry["microseconds"] <= entry["slowest"]

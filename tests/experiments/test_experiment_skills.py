@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from experiments.skills import variants, weights_by_situation
+from sqn_jax.agent import QOutput, Trajectory
 from sqn_jax.policies.pretrained import load_pretrained
 
 
-def driven(steps: list[tuple[float, float, bool, float]]) -> Any:
+def trajectory(steps: list[tuple[float, float, bool, float]]) -> Trajectory:
     """One robot, a row a step: distance to goal, newly seen area, refused, weight of skill 2."""
     distance, area, refused, second = (np.array(x)[:, None] for x in zip(*steps, strict=True))
-    trace = SimpleNamespace(
-        goal_distances=distance,
-        covered_areas=area,
-        collisions=refused.astype(bool),
-        skill_weights=np.stack([1 - second, second], axis=-1),
-    )
-    return None, trace
+    weights: Any = np.stack([1 - second, second], axis=-1)
+    info = {"goal_distance": distance, "covered_area": area, "collision": refused.astype(bool)}
+    return Trajectory(info=info, output=QOutput(weights, weights, weights))
 
 
 def test_each_step_counts_where_it_belongs() -> None:
     found = weights_by_situation(
-        driven(
+        trajectory(
             [
                 (5.0, 1.0, False, 0.2),  # New ground,
                 (5.0, 0.5, False, 0.4),  # and again.
@@ -52,7 +48,7 @@ def test_each_step_counts_where_it_belongs() -> None:
 
 
 def test_a_situation_that_never_came_is_not_told() -> None:
-    assert list(weights_by_situation(driven([(5.0, 1.0, False, 0.5)]))) == ["new ground"]
+    assert list(weights_by_situation(trajectory([(5.0, 1.0, False, 0.5)]))) == ["new ground"]
 
 
 def test_every_skill_is_tried_alone() -> None:

@@ -8,8 +8,16 @@ from typing import Any
 import numpy as np
 
 from experiments.failures import failures
+from sqn_jax.agent import Trajectory
 
 POINTS = np.array([[1.0, 1.0], [9.0, 1.0], [9.0, 9.0]])
+
+
+def batch_of(metrics: Any, poses: Any, goals: Any, collisions: Any) -> Any:
+    trajectory = Trajectory(poses=poses, info={"collision": collisions})
+    return SimpleNamespace(
+        main_metrics=metrics, starts=poses[0], goals=goals, trajectory=trajectory
+    )
 
 
 def test_failures_are_told_apart_by_their_last_steps() -> None:
@@ -26,11 +34,7 @@ def test_failures_are_told_apart_by_their_last_steps() -> None:
     collisions[: steps - 90, 4] = True
     goals = POINTS[[1, 1, 0, 0, 0]]
     summary = SimpleNamespace(success=np.array([True, False, False, False, False]))
-    driven: Any = (
-        [summary, None],
-        SimpleNamespace(poses=poses, goals=goals, collisions=collisions),
-    )
-    told = failures(driven, POINTS)
+    told = failures(batch_of(summary, poses, goals, collisions), POINTS)
     assert (told["episodes"], told["failures"], told["success"]) == (5, 4, 0.2)
     assert told["stand_still_pushing"] == 1
     assert told["stand_still_otherwise"] == 1
@@ -43,9 +47,8 @@ def test_failures_are_told_apart_by_their_last_steps() -> None:
 
 def test_where_none_failed_there_is_nothing_to_tell() -> None:
     poses = np.zeros((31, 1, 3))
-    trace = SimpleNamespace(poses=poses, goals=POINTS[:1], collisions=np.zeros((30, 1), bool))
-    driven: Any = ([SimpleNamespace(success=np.array([True]))], trace)
-    told = failures(driven, POINTS)
+    summary = SimpleNamespace(success=np.array([True]))
+    told = failures(batch_of(summary, poses, POINTS[:1], np.zeros((30, 1), bool)), POINTS)
     assert (told["failures"], told["stand_still_pushing"], told["stand_still_otherwise"]) == (
         0,
         0,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import sys
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from episodes import changed, episode_of
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -62,12 +62,10 @@ def film_episode(*, arrival: int = 0, skills: int = 2, **changes: Any) -> Episod
         "ranges": np.full((STEPS + 1, 11), 0.2),
         "covered": np.stack(seen),
         "actions": np.zeros(STEPS, np.int32),
-        "rewards": np.zeros(STEPS),
         "reward_parts": np.tile([0.0, 0.5, -0.25], (STEPS, 1)),
         "goal_distances": distances,
         "reachable": np.zeros(STEPS, bool),
         "collisions": np.zeros(STEPS, bool),
-        "covered_areas": np.zeros(STEPS),
         "skill_weights": np.tile([0.75, 0.25] if skills == 2 else [1.0], (STEPS, 1)),
         "skill_q_values": np.zeros((STEPS, skills, 5)),
         "q_values": np.zeros((STEPS, 5)),
@@ -78,7 +76,7 @@ def film_episode(*, arrival: int = 0, skills: int = 2, **changes: Any) -> Episod
         "time_step": 0.1,
         "lattice": lattice,
     }
-    return Episode(**(values | changes))
+    return episode_of(values | changes)
 
 
 def drawn(episode: Episode, index: int) -> NDArray[np.uint8]:
@@ -149,8 +147,8 @@ def test_a_decoded_gif_shows_the_frames_that_were_drawn() -> None:
 def test_what_does_not_change_takes_hardly_any_room_in_a_gif() -> None:
     """A robot that stands still: 20 more frames of little but the words and the reward lines."""
     still = film_episode()
-    poses, covered = still.poses[[0] * (STEPS + 1)], still.covered[[0] * (STEPS + 1)]
-    still = dataclasses.replace(still, poses=poses, covered=covered)
+    poses, covered = still.poses[[0] * (STEPS + 1)], still.trajectory.covered[[0] * (STEPS + 1)]
+    still = changed(still, poses=poses, covered=covered)
     assert len(gif(still, count=22)) - len(gif(still, count=2)) < 20 * 4_000
 
 
@@ -358,7 +356,7 @@ def test_a_frame_does_not_depend_on_the_frames_before_it() -> None:
 @pytest.mark.parametrize("arrival", [0, 55])
 def test_a_long_name_is_cut_where_the_words_beside_it_begin(arrival: int) -> None:
     """And is no formula, whatever is in it."""
-    episode = dataclasses.replace(film_episode(arrival=arrival), agent="$x_{$" + 80 * "y")
+    episode = changed(film_episode(arrival=arrival), agent="$x_{$" + 80 * "y")
     screen = Screen(episode, 400, 290)
     screen.draw(60)
     boxes = {

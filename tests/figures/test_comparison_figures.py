@@ -163,7 +163,7 @@ def test_the_entropy_is_a_share_of_what_the_number_of_skills_allows() -> None:
         "two": gate_rows([math.nan, 0.69314718, 0.34657359], skill_distance=[None, 0.2, 0.4]),
         "four": gate_rows([1.38629436, 0.69314718], skills=4),
     }
-    figure = figures.gate_entropy(runs, title="gates")
+    figure = figures.gate_entropy_curves(runs, title="gates")
     drawn(figure)
     entropy, distance = figure.axes
     np.testing.assert_allclose(entropy.lines[0].get_ydata(), [np.nan, 1.0, 0.5])
@@ -177,7 +177,7 @@ def test_the_entropy_is_a_share_of_what_the_number_of_skills_allows() -> None:
 
 def test_runs_that_do_not_know_the_distance_have_one_panel_and_seeds_are_thin() -> None:
     rows = gate_rows([[0.2, 0.4], [0.1, 0.3]])
-    (axes,) = figures.gate_entropy({"SQN": rows}, title="gates").axes
+    (axes,) = figures.gate_entropy_curves({"SQN": rows}, title="gates").axes
     *thin, bold = axes.lines
     assert len(thin) == 2
     np.testing.assert_allclose(bold.get_ydata(), np.array([0.3, 0.2]) / 0.6931471805599453)
@@ -194,7 +194,7 @@ def test_runs_that_do_not_know_the_distance_have_one_panel_and_seeds_are_thin() 
 )
 def test_runs_without_a_skill_decision_are_refused_by_name(runs: Any, named: str) -> None:
     with pytest.raises(ValueError, match=named):
-        figures.gate_entropy(runs, title="none")
+        figures.gate_entropy_curves(runs, title="none")
 
 
 def test_names_with_dollar_signs_are_no_formulas() -> None:
@@ -206,7 +206,7 @@ def test_names_with_dollar_signs_are_no_formulas() -> None:
         figures.map_gallery([walled_room(name)]),
         figures.learning_curve(skilled, title=name),
         figures.learning_curves({name: [skilled]}, title=name),
-        figures.gate_entropy({name: skilled}, title=name),
+        figures.gate_entropy_curves({name: skilled}, title=name),
         figures.robustness([entry(name, 0.0, 0.0, 0.5)], title=name),
         figures.observation_patterns([driven], title=name),
         figures.coverage_example(driven, title=name),

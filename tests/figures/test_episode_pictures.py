@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 import pytest
 from drawing import check_texts, drawn, marks, panels
-from episodes import HEIGHT_M, LATTICE, WIDTH_M, episode
+from episodes import HEIGHT_M, LATTICE, WIDTH_M, changed, episode
 from matplotlib import pyplot
 from matplotlib.patches import Polygon
 
@@ -148,10 +147,10 @@ def test_a_corner_that_hides_the_goal_from_one_beam_only_is_a_last_resort() -> N
     one = moments()
     ranges = one.ranges.copy()
     ranges[3, 18] = 4.5  # of 36 beams 10 degrees apart, 5 degrees to the left
-    hidden, _ = panels(figures.reachability_example(dataclasses.replace(one, ranges=ranges)))
+    hidden, _ = panels(figures.reachability_example(changed(one, ranges=ranges)))
     assert hidden.get_title().startswith("goal 3.0 m away")
     ranges[1:4, 18] = 4.5
-    hidden, _ = panels(figures.reachability_example(dataclasses.replace(one, ranges=ranges)))
+    hidden, _ = panels(figures.reachability_example(changed(one, ranges=ranges)))
     assert hidden.get_title().startswith("goal 2.0 m away"), "all are doubtful, the nearest counts"
 
 
@@ -159,7 +158,7 @@ def test_goals_behind_the_robot_or_beyond_the_sensor_are_not_called_hidden() -> 
     one = moments()
     poses = one.poses.copy()
     poses[3, 2] = math.pi  # the goal lies in the blind angle of step 3
-    turned = dataclasses.replace(one, poses=poses)
+    turned = changed(one, poses=poses)
     hidden, _ = panels(figures.reachability_example(turned))
     assert hidden.get_title().startswith("goal 3.0 m away")
     far = moments(goal_distances=np.array([5.5, 6.0, 7.0, 1.5, 3.2, 2.4, 0.2, 0.1]))

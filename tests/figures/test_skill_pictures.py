@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drawing import check_texts, drawn, marks, panels, ways
-from episodes import episode, walled_room
+from episodes import changed, episode, walled_room
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 
@@ -145,7 +145,7 @@ def test_the_ground_is_the_way_to_the_goal_around_the_wall() -> None:
 def change_start(one: Episode) -> Episode:
     poses = one.poses.copy()
     poses[0, 2] += 0.1
-    return dataclasses.replace(one, poses=poses)
+    return changed(one, poses=poses)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def change_start(one: Episode) -> Episode:
         (lambda tasks: [change_start(tasks[0]), tasks[1]], "agent B, episode 0: another map"),
         (lambda tasks: [tasks[0], tasks[0]], "agent B, episode 1: another map"),
         (
-            lambda tasks: [tasks[0], dataclasses.replace(tasks[1], occupancy_map=other_room())],
+            lambda tasks: [tasks[0], changed(tasks[1], occupancy_map=other_room())],
             "agent B, episode 1: another map",
         ),
         (lambda tasks: tasks[:1], "agent B has 1 episodes, expected 2 as A"),

@@ -20,23 +20,24 @@ from compiling import compiling_quickly
 from PIL import Image
 from rooms import write_empty_room
 
+from sqn_jax.agent import QOutput, Trajectory
 from sqn_jax.cli import main
 from sqn_jax.config import Algorithm, EnvConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import make_env
-from sqn_jax.evaluation.compare import Learnt, Settings, World
+from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings, World
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report import read_runs
 from sqn_jax.report.content import Content, Run, changed_settings
-from sqn_jax.report.episodes import Drive, Hard, Place, densest_place, hardest
-from sqn_jax.report.page import lead, results_table, to_html, words
-from sqn_jax.report.pictures import Picture, Pictures, curves
+from sqn_jax.report.episodes import HardEpisode, Place, densest_place, hardest
+from sqn_jax.report.page import lead, success_table, to_html, words
+from sqn_jax.report.pictures import Illustration, Illustrations, curves
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training.loop import make_program, start_run
-from sqn_jax.training.rollout import EpisodeSummary
+from sqn_jax.training.rollout import EpisodeMetrics
 
 EVIL = '<script>alert("x")</script><img src=http://evil.example/a.png>&amp;$\\frac$'
 
@@ -115,9 +116,9 @@ def world_of(occupancy_map: OccupancyMap) -> World:
     return World(occupancy_map, cast(Any, params), "evaluation points", (0.0, 0.0))
 
 
-def drive_of(
+def batch_of(
     world: World, paths: list[Any], goals: list[tuple[float, float]], reached: list[int]
-) -> Drive:
+) -> EpisodeBatch:
     """Made-up episodes; `reached` is the step of the arrival, 0 for a failure.
 
     Every third move is refused.
@@ -125,11 +126,22 @@ def drive_of(
     poses = np.stack([np.pad(np.asarray(path, float), ((0, 0), (0, 1))) for path in paths], axis=1)
     length, count = len(poses) - 1, len(paths)
     steps = np.array([step or length for step in reached])
-    summary = EpisodeSummary(np.array(reached) > 0, steps, *[np.zeros(count)] * 4)
+    metrics = EpisodeMetrics(np.array(reached) > 0, steps, *[np.zeros(count)] * 4)
     refused = np.repeat(np.arange(length)[:, None] % 3 == 2, count, axis=1)
     agent = Learnt("sqn", (Policy("a", TrainConfig(seed=4), ({},)),))
-    weights = np.full((length, count, 2), 0.5)
-    return Drive(agent, world, 0, 1_000, summary, poses, np.array(goals), refused, weights)
+    weights: Any = np.full((length, count, 2), 0.5)
+    return EpisodeBatch(
+        agent=agent,
+        world=world,
+        training_seed=4,
+        eval_seed=1_000,
+        metrics={0.3: metrics},
+        starts=poses[0],
+        goals=np.array(goals),
+        trajectory=Trajectory(
+            poses=poses, info={"collision": refused}, output=QOutput(weights, weights, weights)
+        ),
+    )
 
 
 def line(start: tuple[float, float], end: tuple[float, float], steps: int) -> Any:
@@ -166,12 +178,12 @@ def test_failures_are_ranked_by_the_way_around_the_wall_not_through_it() -> None
     far_but_open = line((5.05, 1.05), (7.05, 3.05), 8)  # 6 m to go.
     at_hand = line((9.05, 3.05), (2.05, 3.05), 8)  # 1 m to go.
     arrived = line((9.05, 3.05), goal, 8)
-    drives = [
-        drive_of(world, [arrived, at_hand], [goal] * 2, [8, 0]),
-        drive_of(world, [far_but_open, behind_the_wall], [goal] * 2, [0, 0]),
+    batches = [
+        batch_of(world, [arrived, at_hand], [goal] * 2, [8, 0]),
+        batch_of(world, [far_but_open, behind_the_wall], [goal] * 2, [0, 0]),
     ]
-    found = hardest(drives)
-    assert [(hard.drive is drives[1], hard.episode) for hard in found] == [
+    found = hardest(batches)
+    assert [(hard.batch is batches[1], hard.episode) for hard in found] == [
         (True, 1),
         (True, 0),
         (False, 1),
@@ -186,13 +198,13 @@ def test_too_few_failures_are_followed_by_the_slowest_beside_their_way() -> None
     goal = (1.05, 3.05)
     # 2.5 m a second and 0.1 s: 0.25 m a step. 5 m are 20 steps, 2 m are 8.
     paths = [line((6.05, 3.05), goal, 60), line((3.05, 3.05), goal, 60)]
-    drive = drive_of(world, [*paths, paths[0], paths[1]], [goal] * 4, [40, 32, 0, 12])
-    found = hardest([drive])
+    batch = batch_of(world, [*paths, paths[0], paths[1]], [goal] * 4, [40, 32, 0, 12])
+    found = hardest([batch])
     assert [hard.episode for hard in found] == [2, 1, 0]
     assert [hard.success for hard in found] == [False, True, True]
     assert found[1].slowness == pytest.approx(32 / 8, rel=0.02)
     assert found[2].slowness == pytest.approx(40 / 20, rel=0.02)
-    assert len(hardest([drive], count=9)) == 4
+    assert len(hardest([batch], count=9)) == 4
     assert [hard.left for hard in found] == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
 
 
@@ -200,7 +212,7 @@ def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() ->
     world = world_of(hall())
     # 12 steps, the last six of which: four at (8, 1), then away by 2 m. Before, all at (2, 1).
     path = [(2.04, 1.04)] * 7 + [(8.04, 1.04)] * 4 + [(6.04, 1.04)] * 2
-    (hard,) = hardest([drive_of(world, [path], [(9.04, 1.04)], [0])])
+    (hard,) = hardest([batch_of(world, [path], [(9.04, 1.04)], [0])])
     told = words(hard)
     assert "not reached within 12 steps" in told
     assert "stuck: it spent 4 of the last 6 steps within 1 m of (8.0, 1.0) m" in told
@@ -213,7 +225,7 @@ def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() ->
 def test_a_robot_that_was_nowhere_for_long_is_not_called_stuck() -> None:
     world = world_of(hall())
     path = line((1.05, 1.05), (8.65, 1.05), 8)
-    (hard,) = hardest([drive_of(world, [path], [(1.05, 3.05)], [0])])
+    (hard,) = hardest([batch_of(world, [path], [(1.05, 3.05)], [0])])
     # The last four lie 0.95 m apart: the two in the middle have one neighbour on each side.
     assert "stuck: it spent 3 of the last 4 steps" in words(hard)
     swift = dataclasses.replace(hard, place=Place(6.0, 1.0, 1, 4))
@@ -223,7 +235,7 @@ def test_a_robot_that_was_nowhere_for_long_is_not_called_stuck() -> None:
 def test_of_a_success_only_the_way_to_the_goal_counts() -> None:
     world = world_of(hall())
     path = [(2.05, 1.05)] * 4 + [(8.05, 1.05)] * 9  # Reached at step 4, where it stays.
-    (hard,) = hardest([drive_of(world, [path], [(8.05, 1.05)], [4])])
+    (hard,) = hardest([batch_of(world, [path], [(8.05, 1.05)], [4])])
     assert (hard.place.steps, hard.place.of) == (3, 4)
     assert hard.place.x == pytest.approx(2.05)
     assert hard.refused == 1  # The third move; the others came after the arrival.
@@ -246,7 +258,7 @@ RESULTS = [
 
 
 def test_the_table_holds_the_evaluation_s_numbers_and_the_paper_s_beside_them() -> None:
-    page = Page(results_table(RESULTS, Settings(maps=("maze", "hall.yaml"))))
+    page = Page(success_table(RESULTS, Settings(maps=("maze", "hall.yaml"))))
     assert page.rows[0] == ["", "maze", "hall"]
     assert page.row("sqn") == ["0.75 [0.38, 0.88]", "123.4", "0.25 [0.12, 0.62]", "1,234.5"]
     assert page.row("bug (wall follower)")[:2] == ["0.50 [0.25, 0.75]", "200.0"]
@@ -254,10 +266,10 @@ def test_the_table_holds_the_evaluation_s_numbers_and_the_paper_s_beside_them() 
 
 
 def test_a_user_s_own_map_called_maze_is_not_set_beside_the_paper_s() -> None:
-    page = Page(results_table(RESULTS, Settings(maps=("my/maze.yaml", "hall.yaml"))))
+    page = Page(success_table(RESULTS, Settings(maps=("my/maze.yaml", "hall.yaml"))))
     assert "paper" not in page.text
     pairs = [{**each, "tasks": "random pairs"} for each in RESULTS]
-    assert "paper" not in Page(results_table(pairs, Settings(maps=("maze", "hall.yaml")))).text
+    assert "paper" not in Page(success_table(pairs, Settings(maps=("maze", "hall.yaml")))).text
 
 
 def test_what_differs_from_the_nearest_preset_is_named_and_nothing_else() -> None:
@@ -271,10 +283,10 @@ def test_what_differs_from_the_nearest_preset_is_named_and_nothing_else() -> Non
     assert changed_settings(PRESETS["paper"]) == ("paper", [])
 
 
-def picture(kind: str) -> Picture:
+def picture(kind: str) -> Illustration:
     file = io.BytesIO()
     Image.new("P", (3, 2)).save(file, format=kind)
-    return Picture(file.getvalue(), EVIL, EVIL)
+    return Illustration(file.getvalue(), EVIL, EVIL)
 
 
 def evil_content() -> Content:
@@ -282,15 +294,15 @@ def evil_content() -> Content:
     policy = Policy(EVIL, dataclasses.replace(TrainConfig(), map=EVIL), ({},))
     run = Run(EVIL, policy, [], {"device": EVIL, "versions": {EVIL: EVIL}})
     agent = Learnt(EVIL, (policy,))
-    drive = drive_of(world_of(hall(EVIL)), [line((1.05, 1.05), (2, 1), 4)], [(9.05, 1.05)], [0])
-    hard = Hard(dataclasses.replace(drive, agent=agent), 0, 8.0, 7.0, Place(2.0, 1.0, 2, 2))
+    batch = batch_of(world_of(hall(EVIL)), [line((1.05, 1.05), (2, 1), 4)], [(9.05, 1.05)], [0])
+    hard = HardEpisode(dataclasses.replace(batch, agent=agent), 0, 8.0, 7.0, Place(2.0, 1.0, 2, 2))
     results = [entry(EVIL, EVIL, 0.5, 100.0)]
     settings = Settings(maps=(EVIL,), eval_seeds=1)
-    return Content([run], [agent], settings, {"results": results}, [hard.drive], [hard])
+    return Content([run], [agent], settings, {"results": results}, [hard.batch], [hard])
 
 
 def test_hostile_names_are_text_and_nothing_else() -> None:
-    pictures = Pictures([picture("PNG")], [], [picture("PNG")], 3, picture("GIF"))
+    pictures = Illustrations([picture("PNG")], [], [picture("PNG")], 3, picture("GIF"))
     html = to_html(evil_content(), pictures)
     page = Page(html)
     needs_nothing(page)

@@ -1,0 +1,230 @@
+"""Who is evaluated, and what comes of it: policies and baselines, and a batch of their episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sqn_jax.agent.networks import Params, QNetwork
+from sqn_jax.agent.trajectory import Trajectory
+from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.evaluation import baseline_episodes, episodes
+from sqn_jax.evaluation.settings import Settings, World, task_key
+from sqn_jax.evaluation.statistics import success_weighted_path_length
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.rollout import EpisodeMetrics
+from sqn_jax.training.state import network_of
+
+OnBatch = Callable[[int], object]
+"""Called with the number of episodes that have just been run."""
+
+
+class Agent(Protocol):
+    """Whoever acts."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def algorithm(self) -> str: ...
+    @property
+    def env_config(self) -> EnvConfig:
+        """The robot and its sensors."""
+
+    @property
+    def training_seeds(self) -> Sequence[int | None]:
+        """One None for an agent that was not trained."""
+
+    def run(
+        self,
+        eval_seed: int,
+        training_seed: int | None,
+        world: World,
+        settings: Settings,
+        fields: Sequence[str],
+        on_batch: OnBatch,
+    ) -> tuple[list[EpisodeMetrics], Trajectory]:
+        """The episodes of an evaluation seed.
+
+        Args:
+            eval_seed: lays down tasks and noise.
+            training_seed: whose policy acts.
+            world: where.
+            settings: how many episodes, and the goal radii.
+            fields: what of the trajectory is wanted.
+            on_batch: called as the episodes are run.
+
+        Returns:
+            For each goal radius one number an episode [E], and these fields of all steps.
+        """
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Policies of one agent: runs that differ in nothing but their seeds."""
+
+    name: str
+    policies: tuple[Policy, ...]
+
+    @property
+    def algorithm(self) -> str:
+        return self.policies[0].config.algo
+
+    @property
+    def env_config(self) -> EnvConfig:
+        return self.policies[0].config.env
+
+    @property
+    def network(self) -> QNetwork:
+        return network_of(self.policies[0].config)
+
+    @property
+    def training_seeds(self) -> Sequence[int | None]:
+        return [seed for policy in self.policies for seed in policy.training_seeds]
+
+    def params(self, training_seed: int | None) -> Params:
+        """The parameters that the run with this seed came to."""
+        every = [params for policy in self.policies for params in policy.params]
+        return every[self.training_seeds.index(training_seed)]
+
+    def run(
+        self,
+        eval_seed: int,
+        training_seed: int | None,
+        world: World,
+        settings: Settings,
+        fields: Sequence[str],
+        on_batch: OnBatch,
+    ) -> tuple[list[EpisodeMetrics], Trajectory]:
+        return episodes.run_episodes(
+            episodes.episode_keys(task_key(eval_seed, world.tasks), settings.episodes),
+            self.params(training_seed),
+            world.env_params,
+            self.network,
+            goal_radii=settings.goal_radii,
+            fields=fields,
+            on_batch=on_batch,
+        )
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A baseline, which was not trained: `oracle` knows the map, `bug` sees what agents see."""
+
+    name: Literal["oracle", "bug"]
+    env_config: EnvConfig
+    training_seeds: Sequence[int | None] = (None,)
+
+    @property
+    def algorithm(self) -> str:
+        return self.name
+
+    def run(
+        self,
+        eval_seed: int,
+        training_seed: int | None,
+        world: World,
+        settings: Settings,
+        fields: Sequence[str],
+        on_batch: OnBatch,
+    ) -> tuple[list[EpisodeMetrics], Trajectory]:
+        del training_seed
+        key = task_key(eval_seed, world.tasks)
+        if self.name == "oracle":
+            choose = baseline_episodes.oracle(world.occupancy_map, world.env_params)
+        else:
+            choose = baseline_episodes.bug(world.env_params, settings.episodes)
+        metrics, trajectory = baseline_episodes.run_baseline(
+            episodes.episode_keys(key, settings.episodes),
+            choose,
+            world.env_params,
+            goal_radii=settings.goal_radii,
+            fields=fields,
+        )
+        on_batch(settings.episodes)
+        return metrics, trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeBatch:
+    """The E episodes of one training seed in one world under one evaluation seed."""
+
+    agent: Agent
+    world: World
+    training_seed: int | None
+    """None for a baseline, which was not trained."""
+    eval_seed: int
+    metrics: Mapping[float, EpisodeMetrics]
+    """By the goal radius, m, in the order of the settings; NumPy arrays [E]."""
+    starts: NDArray[np.floating]
+    """[E, 3] x m, y m, heading rad."""
+    goals: NDArray[np.floating]
+    """[E, 2] x m, y m."""
+    shortest_paths: NDArray[np.floating] | None = None
+    """[E] m, from start to goal; None where they were not worked out."""
+    trajectory: Trajectory = field(default_factory=Trajectory)
+    """Of all steps what was asked for, NumPy arrays; nothing in the results of an evaluation."""
+
+    @property
+    def main_metrics(self) -> EpisodeMetrics:
+        """Those for the first goal radius."""
+        return next(iter(self.metrics.values()))
+
+    def numbers(self, goal_radius: float) -> dict[str, NDArray[np.float64]]:
+        """Every number of an episode by the name it has in the files, [E] each."""
+        metrics = self.metrics[goal_radius]
+        named: dict[str, ArrayLike] = {
+            "success": metrics.success,
+            "time_steps": metrics.time_steps,
+            "mean_reward": metrics.mean_reward,
+            "collisions": metrics.collisions,
+            "coverage_m2": metrics.covered_area,
+            "path_length_m": metrics.path_length,
+        }
+        if self.shortest_paths is not None:
+            named["spl"] = success_weighted_path_length(
+                metrics.success, metrics.path_length, self.shortest_paths
+            )
+        return {name: np.asarray(values, np.float64) for name, values in named.items()}
+
+
+def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
+    """Pool the runs that differ in nothing but their seeds; each pool is one agent.
+
+    Raises:
+        ValueError: a training seed comes twice in a pool.
+    """
+    pools: dict[TrainConfig, list[Policy]] = {}
+    for policy in policies:
+        same = dataclasses.replace(
+            policy.config,
+            seed=0,
+            num_seeds=1,
+            checkpoint_minutes=1.0,
+            checkpoint_replay=True,
+            max_skipped_updates=0,
+        )
+        pools.setdefault(same, []).append(policy)
+    algorithms = [config.algo for config in pools]
+    agents = []
+    for config, pool in pools.items():
+        alone = algorithms.count(config.algo) == 1
+        agent = Learnt(config.algo if alone else f"{config.algo} {pool[0].name}", tuple(pool))
+        seeds = list(agent.training_seeds)
+        if len(set(seeds)) < len(seeds):
+            folders = ", ".join(policy.name for policy in pool)
+            raise ValueError(f"runs {folders}: the same settings and the same training seed twice")
+        agents.append(agent)
+    return agents
+
+
+def with_references(agents: Sequence[Agent], *, references: bool) -> list[Agent]:
+    """The agents, and after them the navigators that were not trained, with the first's robot."""
+    if not references:
+        return list(agents)
+    robot = agents[0].env_config if agents else EnvConfig()
+    return [*agents, Reference("bug", robot), Reference("oracle", robot)]

@@ -1,0 +1,121 @@
+"""What is evaluated: maps, tasks, noise and seeds, and the worlds that they make."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+
+from sqn_jax.config import EnvConfig
+from sqn_jax.env import EnvParams, make_env
+from sqn_jax.env.prepare import with_noise
+from sqn_jax.maps import OccupancyMap
+
+Tasks = Literal["evaluation points", "random pairs"]
+SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
+    "evaluation points": "evaluation",
+    "random pairs": "training",
+}
+"""The two kinds of tasks, and the spawn mode that draws them."""
+
+MOST_EPISODES, MOST_STEPS = 100_000, 100_000
+"""Under one evaluation seed, and an episode: more would not fit into memory."""
+
+Maps = Mapping[tuple[str, float], OccupancyMap]
+"""Maps by their name in the settings and the radius of the robot, m, they were loaded for."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an evaluation is made of."""
+
+    maps: tuple[str, ...]
+    """Maps of the project by name, or files."""
+    tasks: tuple[Tasks, ...] = ("evaluation points",)
+    episodes: int = 100
+    """Episodes under each evaluation seed."""
+    eval_seeds: int = 5
+    """How many evaluation seeds."""
+    seed: int = 1_000
+    """The first of them."""
+    noise: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    """Pairs of velocity noise and range noise."""
+    noise_unit: Literal["relative", "absolute"] | None = None
+    """Reading of both, see `EnvConfig`; None as each robot was configured."""
+    goal_radii: tuple[float, ...] = (0.3, 0.5)
+    """m; each radius is judged from the same episodes."""
+    max_steps: int = 0
+    """Steps an episode; 0 for each map's own limit."""
+
+    @property
+    def all_eval_seeds(self) -> list[int]:
+        """The evaluation seeds, one after the other."""
+        return [self.seed + index for index in range(self.eval_seeds)]
+
+    def __post_init__(self) -> None:
+        for name, limit in (("episodes", MOST_EPISODES), ("eval_seeds", 10_000)):
+            if not 1 <= getattr(self, name) <= limit:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, expected at least 1 and at most {limit:,}"
+                )
+        if not 0 <= self.max_steps <= MOST_STEPS:
+            raise ValueError(f"max_steps is {self.max_steps}, expected 0 to {MOST_STEPS:,}")
+        if not 0 <= self.seed <= 2**31 - self.eval_seeds:
+            raise ValueError(
+                f"seed is {self.seed}, expected 0 to {2**31 - self.eval_seeds} for "
+                f"{self.eval_seeds} evaluation seeds"
+            )
+        for level in (level for pair in self.noise for level in pair):
+            if not 0 <= level <= 1e6:
+                raise ValueError(f"noise is {level}, expected 0 to 1000000")
+        for radius in self.goal_radii:
+            if not 1e-6 <= radius <= 1e6:
+                raise ValueError(f"goal radius is {radius}, expected 0.000001 to 1000000 m")
+        for name in ("maps", "tasks", "noise", "goal_radii"):
+            given = getattr(self, name)
+            for one in given:
+                if given.count(one) > 1:
+                    raise ValueError(f"{name}: {one} comes twice, expected each once")
+        if not (self.maps and self.tasks and self.noise and self.goal_radii):
+            raise ValueError("nothing to evaluate: expected a map, a task and a goal radius")
+
+
+@dataclass(frozen=True)
+class World:
+    """A map made ready for a robot, some tasks and some noise."""
+
+    occupancy_map: OccupancyMap
+    env_params: EnvParams
+    tasks: Tasks
+    noise: tuple[float, float]
+
+
+def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
+    """The robot and its sensors, without what belongs to training or comes from the settings."""
+    return dataclasses.replace(
+        env_config,
+        max_steps=settings.max_steps,
+        near_goal_fraction=0.0,
+        velocity_noise=0.0,
+        velocity_noise_unit=settings.noise_unit or env_config.velocity_noise_unit,
+        range_noise=0.0,
+        range_noise_unit=settings.noise_unit or env_config.range_noise_unit,
+    )
+
+
+def worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
+    """Every map, task and noise of an evaluation for a robot from `robot_for`."""
+    for name in settings.maps:
+        occupancy_map = maps[name, robot.robot_radius]
+        for tasks in settings.tasks:
+            quiet = make_env(occupancy_map, robot, spawn=SPAWN_MODES[tasks])
+            for noise in settings.noise:
+                yield World(occupancy_map, with_noise(quiet, *noise), tasks, noise)
+
+
+def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
+    """The key of the episodes of an evaluation seed; every agent gets the same."""
+    return jax.random.fold_in(jax.random.key(eval_seed), list(SPAWN_MODES).index(tasks))
