@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines.shortest_paths import shortest_ways
+from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.env.prepare import with_noise
@@ -362,7 +362,7 @@ def _ways(
     world: World, starts: NDArray[np.floating], goals: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     robot_radius = world.env_params.config.robot_radius
-    return shortest_ways(world.occupancy_map, starts, goals, robot_radius=robot_radius)
+    return shortest_path_lengths(world.occupancy_map, starts, goals, robot_radius=robot_radius)
 
 
 def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
