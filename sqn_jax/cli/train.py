@@ -14,7 +14,6 @@ from pathlib import Path
 from sqn_jax.cli.words import CACHE, Parser, add_device, folder
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.presets import PRESETS
-from sqn_jax.runs.signals import last_words
 
 
 def train(words: list[str]) -> int:
@@ -120,14 +119,14 @@ def _run_training(config: TrainConfig, run_dir: Path, own: argparse.Namespace) -
     for name in ("device", "num_devices"):  # On others it would not be the same to the bit.
         value = getattr(own, name)
         command += "" if value is None else f" --{name.replace('_', '-')} {value}"
-    with last_words(f"go on with `{command}`"):
-        train_session(
-            config,
-            run_dir,
-            resume=own.resume,
-            num_devices=own.num_devices,
-            tensorboard=own.tensorboard,
-        )
+    train_session(
+        config,
+        run_dir,
+        resume=own.resume,
+        num_devices=own.num_devices,
+        tensorboard=own.tensorboard,
+        go_on=f"`{command}`",
+    )
     return 0
 
 
