@@ -12,7 +12,7 @@ from typing import Any
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.evaluation.compare import Settings, load_maps, with_references
-from sqn_jax.runs.signals import Interrupted, interruptible, last_words, say_stopped
+from sqn_jax.runs.signals import Interrupted, end_at_once
 from sqn_jax.runs.train import train_session
 from sqn_jax.storage.checkpoint import NotSaved
 from sqn_jax.storage.run_folder import RunFolder
@@ -100,15 +100,15 @@ def _train(config: TrainConfig, folder: Path) -> None:
     if (folder / "summary.json").is_file():
         print(f"{folder} is trained")
         return
-    train_session(config, folder, resume=begun)
+    train_session(config, folder, resume=begun, go_on="the same command")
 
 
 def run(main: Any) -> None:
     """Call an experiment's main; unusable input is one line and exit code 2."""
     name = Path(sys.argv[0]).name
+    end_at_once()
     try:
-        with interruptible(name), last_words("the same command goes on from here"):
-            main()
+        main()
     except (ValueError, OSError, json.JSONDecodeError) as error:
         print(f"{name}: {error}", file=sys.stderr)
         raise SystemExit(1 if isinstance(error, NotSaved) else 2) from None
@@ -116,5 +116,5 @@ def run(main: Any) -> None:
         print(f"{name}: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except Interrupted as stop:
-        say_stopped(stop.signal, name)
+        print(f"\n{name}: {stop}", file=sys.stderr)
         raise SystemExit(stop.exit_code) from None

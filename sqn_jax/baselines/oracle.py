@@ -7,19 +7,18 @@ an estimate of what is left: the shortest way to the goal over the map, the turn
 and the bends along it. Without noise a plan holds to the end, but for the rare move that the
 simulator's single precision refuses: it is then planned anew without that move. With noise on the
 velocity a short search mends the plan after each step. Beam search is not proven optimal: see
-`tests/baselines/test_oracle.py` for how it stands to a full search on the lattice of
-`shortest_paths.oracle_steps`.
+`tests/baselines/test_oracle.py` for how it stands to a full search on a lattice.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sqn_jax.baselines.shortest_paths import Ways
+from sqn_jax.baselines.shortest_paths import ShortestPaths
 from sqn_jax.env import EnvParams
 from sqn_jax.env.geometry import wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
@@ -45,7 +44,7 @@ class Oracle:
     """Plans for E robots, each with its own goal, and keeps the plans while they hold."""
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
-        """Compute the ways to all goals [E, 2]; a goal that occurs twice is computed once."""
+        """Compute the paths to all goals [E, 2]; a goal that occurs twice is computed once."""
         self.search = BeamSearch(occupancy_map, env_params, goals)
         self.goals = goals
         self.steps_left = env_params.max_steps
@@ -96,6 +95,25 @@ class Oracle:
                 return
 
 
+class _Beam(NamedTuple):
+    """The poses [P] that the search goes on from; all have taken equally many steps."""
+
+    robot: Ints
+    """Whose they are."""
+    parent: Ints
+    """Where in the beam before they came from."""
+    action: Ints
+    """What led here; `STAND` at the start."""
+    pose: Floats
+    """[P, 3] x, y, m, and heading, rad."""
+    turns: Ints
+    """Turns made so far, to the left less those to the right: the heading, without rounding."""
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> _Beam:
+        """Copies of some of them, by number or by mask."""
+        return _Beam._make(each[index] for each in self)
+
+
 class BeamSearch:
     """Searches forward from given poses towards given goals, for many robots at once."""
 
@@ -120,7 +138,7 @@ class BeamSearch:
         self.goals = goals
         self.refused: list[tuple[int, Floats, int]] = []
         """Moves to leave out: robot, pose, action."""
-        self.ways = Ways(self.free, self.resolution, goals, self.turn)
+        self.paths = ShortestPaths(self.free, self.resolution, goals, self.turn)
 
     def plan(
         self, robots: Ints, poses: Floats, *, steps: int, width: int
@@ -137,59 +155,61 @@ class BeamSearch:
             For each robot its actions [S], the poses [S, 3] before each of them, and whether they
             lead to the goal; if not, they lead to the best place within `steps`.
         """
-        who, pose = np.arange(len(robots)), poses
-        last = turned = np.zeros(len(robots), np.int64)
-        alive = who
-        layers = [(who, last, pose)]
+        nobody = np.zeros(len(robots), np.int64)
+        beam = _Beam(np.arange(len(robots)), nobody, nobody, poses, nobody)
+        beams, alive = [beam], beam.robot
         ends = np.zeros((len(robots), 2), np.int64)
         reached = np.zeros(len(robots), bool)
         for depth in range(1, steps + 1):
-            parent, last, pose, turned = self._expand(alive, last, pose, turned)
-            who = who[parent]
-            allowed = self._allowed(robots[who], layers[-1][2][parent], last)
-            who, parent, last = who[allowed], parent[allowed], last[allowed]
-            pose, turned = pose[allowed], turned[allowed]
-            goals = self.goals[robots[who]]
-            left = self.ways.steps_left(robots[who], pose, self.forward, self.backward)
-            # The tenth of a millimetre is for the simulator's single precision.
-            inside = np.hypot(*(pose[:, :2] - goals).T) < self.goal_radius - 1e-4
+            following = self._expand(beam.take(alive), alive)
+            before = beam.pose[following.parent]
+            following = following.take(
+                self._allowed(robots[following.robot], before, following.action)
+            )
+            owner, pose = robots[following.robot], following.pose
+            left = self.paths.steps_left(owner, pose, self.forward, self.backward)
+            # The tenth of a millimeter is for the simulator's single precision.
+            inside = np.hypot(*(pose[:, :2] - self.goals[owner]).T) < self.goal_radius - 1e-4
             left[inside] = -1.0
-            kept = self._select(who, pose, turned, left, width)
-            who, last, pose, turned = who[kept], last[kept], pose[kept], turned[kept]
-            layers.append((parent[kept], last, pose))
+            best = self._select(following, left, width)
+            beam = following.take(best)
+            beams.append(beam)
             # The best pose of each robot comes first.
-            own, best = np.unique(who, return_index=True)
-            ends[own] = np.stack([np.full(len(own), depth), best], axis=-1)
-            reached[own] = inside[kept][best]
-            alive = np.flatnonzero(~reached[who])
+            own, first = np.unique(beam.robot, return_index=True)
+            ends[own] = np.stack([np.full(len(own), depth), first], axis=-1)
+            reached[own] = inside[best][first]
+            alive = np.flatnonzero(~reached[beam.robot])
             if not alive.size:
                 break
         return [
-            (*_trace_back(layers, int(depth), int(best)), bool(found))
-            for (depth, best), found in zip(ends, reached, strict=True)
+            (*_trace_back(beams, int(depth), int(index)), bool(is_there))
+            for (depth, index), is_there in zip(ends, reached, strict=True)
         ]
 
-    def _expand(
-        self, alive: Ints, last: Ints, pose: Floats, turned: Ints
-    ) -> tuple[Ints, Ints, Floats, Ints]:
-        """All poses one step on: parent, action, pose and turns made; no step straight back."""
+    def _expand(self, beam: _Beam, numbers: Ints) -> _Beam:
+        """All poses one step on from those of a beam; no step straight back.
+
+        Args:
+            beam: where to go on from.
+            numbers: [P] what its poses are called as parents.
+        """
+        beam = beam._replace(parent=numbers)
         parts = []
         for action in (FORWARD, BACKWARD, LEFT, RIGHT):
-            parent = alive[last[alive] != INVERSE[action]]
-            new, turns = pose[parent], turned[parent]
+            part = beam.take(beam.action != INVERSE[action])
             if action in (FORWARD, BACKWARD):
-                way = self.forward if action == FORWARD else -self.backward
-                possible = self.is_clear(new, way)
-                parent, new, turns = parent[possible], new[possible], turns[possible]
-                new[:, 0] += way * np.cos(new[:, 2])
-                new[:, 1] += way * np.sin(new[:, 2])
+                step = self.forward if action == FORWARD else -self.backward
+                part = part.take(self.is_clear(part.pose, step))
+                heading = part.pose[:, 2]
+                part.pose[:, 0] += step * np.cos(heading)
+                part.pose[:, 1] += step * np.sin(heading)
             else:
                 sign = 1 if action == LEFT else -1
-                new[:, 2] = wrap_angle(new[:, 2] + sign * self.turn)
-                turns = turns + sign
-            parts.append((parent, np.full(len(parent), action), new, turns))
-        parent, taken, new, turns = (np.concatenate(p) for p in zip(*parts, strict=True))
-        return parent, taken, new, turns
+                part.pose[:, 2] = wrap_angle(part.pose[:, 2] + sign * self.turn)
+                part.turns[:] += sign
+            part.action[:] = action
+            parts.append(part)
+        return _Beam._make(np.concatenate(each) for each in zip(*parts, strict=True))
 
     def _allowed(self, robots: Ints, before: Floats, action: Ints) -> NDArray[np.bool_]:
         """Which of the moves [N] were not refused before."""
@@ -199,18 +219,16 @@ class BeamSearch:
             allowed[same[_is_at(before[same], pose)]] = False
         return allowed
 
-    def _select(
-        self, who: Ints, pose: Floats, turned: Ints, left: Floats, width: int
-    ) -> NDArray[np.intp]:
+    def _select(self, beam: _Beam, left: Floats, width: int) -> NDArray[np.intp]:
         """The `width` best poses of each robot, best first, one for each cell and heading."""
         headings = max(1, round(2 * np.pi / self.turn))
-        col, row = np.floor(pose[:, :2] / self.resolution).astype(np.int64).T
+        col, row = np.floor(beam.pose[:, :2] / self.resolution).astype(np.int64).T
         cell = row * self.free.shape[1] + col
-        state = (who * self.free.size + cell) * headings + turned % headings
-        order = np.lexsort((left, who))
+        state = (beam.robot * self.free.size + cell) * headings + beam.turns % headings
+        order = np.lexsort((left, beam.robot))
         first = np.sort(np.unique(state[order], return_index=True)[1])
         order = order[first]
-        owner = who[order]
+        owner = beam.robot[order]
         rank = np.arange(len(order)) - np.searchsorted(owner, owner)
         return order[rank < width]
 
@@ -267,14 +285,11 @@ def _is_at(pose: Floats, planned: Floats) -> Any:
     return np.abs(away).max(axis=-1) < ON_PLAN
 
 
-def _trace_back(
-    layers: list[tuple[Ints, Ints, Floats]], depth: int, index: int
-) -> tuple[Ints, Floats]:
+def _trace_back(beams: list[_Beam], depth: int, index: int) -> tuple[Ints, Floats]:
     """Actions and the poses before them that led to one pose of a beam."""
     actions, poses = [], []
-    for parents, taken, _ in layers[depth:0:-1]:
-        depth -= 1
-        actions.append(taken[index])
-        index = parents[index]
-        poses.append(layers[depth][2][index])
+    for beam, before in zip(beams[depth:0:-1], beams[:depth][::-1], strict=True):
+        actions.append(beam.action[index])
+        index = beam.parent[index]
+        poses.append(before.pose[index])
     return np.array(actions[::-1], np.int64), np.array(poses[::-1]).reshape(-1, 3)

@@ -2,8 +2,10 @@
 
 It wires arguments to functions, no more.
 
-Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback),
-130, 143 and 129 stopped by SIGINT, SIGTERM or SIGHUP after saving.
+Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
+143 and 129 as a shell sees them: stopped by SIGINT, SIGTERM or SIGHUP, after saving where there was
+something to save. Where not, the signal itself ends the process, at once, which a parent that is
+no shell sees as such (-2, -15 and -1 in Python's `subprocess`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
 from sqn_jax.cli.train import train
-from sqn_jax.runs.signals import Interrupted, interruptible, say_stopped
+from sqn_jax.runs.signals import Interrupted, end_at_once
 
 USAGE = """usage: sqn COMMAND [OPTIONS]
 
@@ -35,11 +37,10 @@ USAGE = """usage: sqn COMMAND [OPTIONS]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     try:
-        with interruptible():
-            code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
+        code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
         sys.stdout.flush()
     except Interrupted as stop:
-        say_stopped(stop.signal)
+        print(f"\nsqn: {stop}", file=sys.stderr)
         code = stop.exit_code
     except BrokenPipeError:  # Whoever read along, say `head`, has enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -53,6 +54,7 @@ def run() -> NoReturn:
     After a signal or a failure at once: threads of XLA or Orbax may still be at work, and would
     crash or complain while Python is taken down.
     """
+    end_at_once()
     code = main()
     if code == 1 or code > 128:
         sys.stdout.flush()

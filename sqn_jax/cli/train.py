@@ -17,7 +17,6 @@ from sqn_jax.cli.arguments import CACHE, Parser, add_device, folder
 from sqn_jax.cli.settings import add_settings, normalized, option, with_settings
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.presets import PRESETS
-from sqn_jax.runs.signals import last_words
 
 
 def train(arguments: list[str]) -> int:
@@ -147,14 +146,14 @@ def _run_training(config: TrainConfig, run_dir: Path, given: argparse.Namespace)
     for name in ("device", "num_devices"):  # On others it would not be the same to the bit.
         value = getattr(given, name)
         command += "" if value is None else f" --{name.replace('_', '-')} {value}"
-    with last_words(f"go on with `{command}`"):
-        train_session(
-            config,
-            run_dir,
-            resume=given.resume,
-            num_devices=given.num_devices,
-            tensorboard=given.tensorboard,
-        )
+    train_session(
+        config,
+        run_dir,
+        resume=given.resume,
+        num_devices=given.num_devices,
+        tensorboard=given.tensorboard,
+        go_on=f"`{command}`",
+    )
     return 0
 
 

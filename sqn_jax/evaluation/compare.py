@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines.shortest_paths import shortest_ways
+from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import (
     Agent,
@@ -156,7 +156,7 @@ def _batches(
         starts, goals = np.array(trajectory.poses[0]), np.asarray(trajectory.goals)
         tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
         if tasks not in paths:
-            paths[tasks] = shortest_ways(
+            paths[tasks] = shortest_path_lengths(
                 world.occupancy_map, starts, goals, robot_radius=robot_radius
             )
         yield EpisodeBatch(

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from sqn_jax.maps.files import one_line
-from sqn_jax.maps.png import require_all_rows
 
 MAX_PIXELS = 64 * 2**20
 MAX_IMAGE_BYTES = 512 * 2**20
@@ -72,17 +71,40 @@ def read_pixels(path: Path, mode: str) -> GreyImage:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            with Image.open(io.BytesIO(data), formats=("PNG", "PPM")) as image:
+            with _opened(data) as image:
                 width, height = image.size
                 if width * height > MAX_PIXELS:
                     raise ValueError(f"{width} x {height} pixels, expected at most {MAX_PIXELS}")
-                require_all_rows(data)
+                is_png = image.format == "PNG"
+            if is_png:
+                _require_whole_png(data)
+            with _opened(data) as image:
                 return _to_grey(image, mode)
         except UnidentifiedImageError as error:
             raise ValueError("contents of another kind, expected a PNG or PGM image") from error
         # Pillow's decoders raise a dozen kinds of error on damaged files: each means unusable.
         except Exception as error:
             raise ValueError(f"{one_line(error)}, expected a readable PNG or PGM image") from error
+
+
+def _opened(data: bytes) -> Image.Image:
+    return Image.open(io.BytesIO(data), formats=("PNG", "PPM"))
+
+
+def _require_whole_png(data: bytes) -> None:
+    """Refuse wrong checksums and missing rows; Pillow itself tells of the rest when it decodes."""
+    # Rows that are missing stay what they were before decoding: they differ if that does.
+    if _last_rows(data, 0) != _last_rows(data, 1):
+        raise ValueError("rows of pixels are missing")
+    with _opened(data) as image:
+        image.verify()
+
+
+def _last_rows(data: bytes, before: int) -> bytes:
+    """The end of an image decoded over pixels of a value; of an interlaced one that is two rows."""
+    with _opened(data) as image:
+        image.im = Image.new(image.mode, image.size, before).im
+        return image.crop((0, max(0, image.height - 2), *image.size)).tobytes()
 
 
 def _to_grey(image: Image.Image, mode: str) -> GreyImage:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines.shortest_paths import shortest_ways
+from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.evaluation.compare import EpisodeBatch, World
 
 Floats = NDArray[np.floating]
@@ -147,7 +147,7 @@ def _ways(
     world: World, places: NDArray[np.floating], goals: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     robot_radius = world.env_params.config.robot_radius
-    return shortest_ways(world.occupancy_map, places, goals, robot_radius=robot_radius)
+    return shortest_path_lengths(world.occupancy_map, places, goals, robot_radius=robot_radius)
 
 
 def _fewest_steps(batch: EpisodeBatch, way: float) -> float:

@@ -15,19 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jax import Array
 
 from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
-from sqn_jax.maps import load_map
+from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation
 from sqn_jax.runs.progress import episodes_bar
-from sqn_jax.runs.signals import Interrupted, collected
+from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
 from sqn_jax.storage import manifest
-from sqn_jax.storage.checkpoint import Checkpoints
+from sqn_jax.storage.checkpoint import Checkpoints, chunks_in
 from sqn_jax.storage.compile_cache import kept_programs, watched_compilation
 from sqn_jax.storage.lock import locked
 from sqn_jax.storage.manifest import Manifest, Origin
@@ -54,6 +55,7 @@ def train_session(
     resume: bool = False,
     num_devices: int | None = None,
     tensorboard: bool = False,
+    go_on: str = "",
 ) -> None:
     """Train, evaluate and draw, telling the terminal about it.
 
@@ -64,6 +66,7 @@ def train_session(
             was stopped before its first.
         num_devices: see `devices.choose`.
         tensorboard: write metrics and pictures for TensorBoard, too.
+        go_on: what a run that is stopped is gone on with, as the user is told.
 
     Raises:
         ValueError: the map, the folder or the number of devices is unusable, the run does not fit
@@ -75,37 +78,46 @@ def train_session(
     """
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
-    start = None if resume else _starting_policy(config)
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
-    # Refuses a window that does not fit before anything is written.
     program = make_program(env_params, config, mesh)
+    # What is refused up to here leaves nothing behind.
     num_bytes = memory_bytes(env_params, program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
     if tensorboard:
         require_tensorboard()
+    is_saved = resume and bool(chunks_in(run_dir / CHECKPOINTS))
+    start = None if is_saved else _starting_policy(config)
     origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
     with ExitStack() as stack:
         stack.enter_context(locked(run_dir))
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
         runner = _restored(env_params, program, folder, checkpoints) if resume else None
-        _announce(program, run_dir, num_bytes)
+        _announce(program, run_dir, num_bytes, go_on)
         done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        if runner is None and resume:
-            start = _starting_policy(config)
-        training = _Training(env_params, program, folder, checkpoints, start)
-        runner = training.drive(runner, None if board is None else board.scalars)
-        if occupancy_map.tiles != (1, 1):
-            first = config.maps.names[0]
-            occupancy_map = load_map(first, robot_radius=config.env.robot_radius)
-        results, drawn = final_evaluation.evaluate(runner, occupancy_map, config, folder)
-        figures = final_evaluation.draw(drawn, occupancy_map, config, folder)
+        training = _Training(env_params, program, folder, checkpoints, start, go_on)
+        runner = training.run(runner, None if board is None else board.scalars)
+        first_map = _first_map(config, occupancy_map)
+        results, drawn = final_evaluation.evaluate(runner, first_map, config, folder)
+        figures = final_evaluation.draw(drawn, first_map, config, folder)
         if board is not None and figures:
-            for path in sorted(folder.figures.glob("*.png")):
-                board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
+            _show_figures(board, config, folder)
     final_evaluation.conclude(results, training.timing, figures, config, folder)
+
+
+def _first_map(config: TrainConfig, occupancy_map: OccupancyMap) -> OccupancyMap:
+    """The map to evaluate on: that of the run, or the first of several that lie side by side."""
+    if occupancy_map.tiles == (1, 1):
+        return occupancy_map
+    return load_map(config.maps.names[0], robot_radius=config.env.robot_radius)
+
+
+def _show_figures(board: Board, config: TrainConfig, folder: RunFolder) -> None:
+    # Not the hidden ones, which a process that was killed has left behind.
+    for path in sorted(folder.figures.glob("[!.]*.png")):
+        board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
 
 
 def _starting_policy(config: TrainConfig) -> Policy | None:
@@ -117,7 +129,7 @@ def _starting_policy(config: TrainConfig) -> Policy | None:
     return policy
 
 
-def _announce(program: Program, run_dir: Path, num_bytes: int) -> None:
+def _announce(program: Program, run_dir: Path, num_bytes: int, go_on: str) -> None:
     config = program.config
     seeds = f"seed {config.seed}"
     if config.num_seeds > 1:
@@ -132,6 +144,8 @@ def _announce(program: Program, run_dir: Path, num_bytes: int) -> None:
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
         print("checkpoints without the replay: a run that is stopped does not go on exactly")
+    if go_on:  # Where a signal ends the process at once, nothing can be said any more.
+        print(f"if it is stopped, go on with {go_on}", flush=True)
 
 
 def _restored(
@@ -203,7 +217,7 @@ def _compare_makes(saved: Manifest, num_devices: int) -> None:
 
 
 class _Training:
-    """Drives a training to its end, with everything that is written on the way."""
+    """Takes a training to its end, with everything that is written on the way."""
 
     def __init__(
         self,
@@ -212,10 +226,11 @@ class _Training:
         folder: RunFolder,
         checkpoints: Checkpoints,
         start: Policy | None,
+        go_on: str,
     ) -> None:
         config, mesh = program.config, program.mesh
         self._env_params, self._program, self._config = env_params, program, config
-        self._start = start
+        self._start, self._go_on = start, go_on
         self._folder, self._checkpoints = folder, checkpoints
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
@@ -228,7 +243,7 @@ class _Training:
         self._successes: list[float] = []
         self._saved_at = time.monotonic()
 
-    def drive(
+    def run(
         self, runner: RunnerState | None, on_row: Callable[[dict[str, Any]], None] | None
     ) -> RunnerState:
         """From a state, or from the beginning, to the end; returns the final state."""
@@ -244,7 +259,7 @@ class _Training:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
         saving = "stopping after this chunk and saving"
-        with collected(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
+        with deferred(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
             for runner, report in run(runner, self._env_params, self._program, compiled):  # noqa: B020
                 row = self._keep(report)
                 if on_row is not None:
@@ -258,7 +273,7 @@ class _Training:
                 if received:
                     break
         if received:
-            raise Interrupted(received[0])
+            raise Interrupted(received[0], self._go_on)
         return runner
 
     def _compile(self) -> CompiledChunk:
@@ -271,7 +286,15 @@ class _Training:
         print(f"\r{how} in {seconds:.1f} s")
         needed = memory_budget.compiled_bytes(compiled)
         memory_budget.require(needed, "training", self._config.method)
-        return compiled
+
+        def run_chunk(
+            runner: RunnerState, env_params: EnvParams
+        ) -> tuple[RunnerState, dict[str, Array]]:
+            runner, metrics = compiled(runner, env_params)
+            wait_for(metrics)
+            return runner, metrics
+
+        return run_chunk
 
     def _keep(self, report: ChunkReport) -> dict[str, Any]:
         """Count a chunk and write its row."""

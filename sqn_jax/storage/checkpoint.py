@@ -46,6 +46,14 @@ class NotSaved(OSError):
     """A checkpoint could not be written; the older ones are as they were."""
 
 
+def chunks_in(folder: Path) -> list[int]:
+    """Chunks done at each checkpoint in a folder, the oldest first; none if there is no folder."""
+    if not folder.is_dir():
+        return []
+    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    return sorted(int(name) for name in names if name.isascii() and name.isdigit())
+
+
 class Checkpoints:
     """The checkpoints of one run folder; use as a context manager."""
 
@@ -62,10 +70,7 @@ class Checkpoints:
 
     def chunks(self) -> list[int]:
         """Chunks done at each checkpoint, the oldest first."""
-        if not self._folder.is_dir():
-            return []
-        names = [path.name for path in self._folder.iterdir() if path.is_dir()]
-        return sorted(int(name) for name in names if name.isascii() and name.isdigit())
+        return chunks_in(self._folder)
 
     def save(
         self, chunk: int, runner: RunnerState, *, score: float | None = None, light: bool = False

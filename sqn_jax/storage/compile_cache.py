@@ -1,12 +1,7 @@
 """Compiled programs kept on disk, so that the next start reads them instead of compiling.
 
-JAX does the keeping (its persistent compilation cache); this module says where and for how long,
-finds what is damaged, and tells what is wrong in one line. JAX's key holds the program, the
-versions, the flags and the instruction set of the processor: a home shared by different machines
-is no danger.
-
-What is read is executed. The folder is therefore private, and one that others can write to is not
-used. Whoever imports the library gets no cache: only `session` asks for one.
+JAX does the keeping (its persistent compilation cache). What is read is executed: the folder is
+private, and one that others can write to is not used. Whoever imports the library gets no cache.
 """
 
 from __future__ import annotations
@@ -21,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
@@ -34,15 +30,13 @@ VARIABLE = "SQN_JAX_CACHE"
 LARGEST_BYTES = 2**28
 """What the folder may hold when a run starts; all programs of a run take a few MB."""
 
-ENTRY, SEAL = "-cache", "-sha256"
-"""Endings: of JAX's entries, and of the checksum beside each."""
+ENTRY = "-cache"
+"""How JAX's files end; a checksum lies beside each."""
 
 _TROUBLE = re.compile(
-    r"Error (?P<verb>reading|writing) persistent compilation cache entry "
-    r"for '(?P<program>[^']*)': (?P<reason>.*)",
-    re.DOTALL,
+    r"Error (reading|writing) persistent compilation cache entry for '([^']*)': (.*)", re.DOTALL
 )
-"""How JAX warns of an entry it cannot use; it then compiles as if there were none."""
+"""How JAX warns of a program it cannot use; it then compiles as if there were none."""
 
 
 @contextmanager
@@ -52,14 +46,19 @@ def kept_programs() -> Iterator[None]:
     If not, one line on stderr says why. A cache the user has set up for JAX itself
     (`JAX_COMPILATION_CACHE_DIR`) is left as it is.
     """
-    folder = None if _is_decided() else _open_folder()
+    chosen = os.environ.get(VARIABLE, "").strip()
+    is_decided = _setting("jax_compilation_cache_dir") or not _setting(
+        "jax_enable_compilation_cache"
+    )
+    folder = None if is_decided or chosen.lower() == "off" else _open_folder(chosen)
     if folder is None:
         yield
         return
-    options: dict[str, object] = {"jax_compilation_cache_dir": str(folder)}
-    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+    options: dict[str, Any] = {
+        "jax_compilation_cache_dir": str(folder),
         # Two dozen small programs of a run take a second together.
-        options["jax_persistent_cache_min_compile_time_secs"] = 0.0
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+    }
     before = {name: _setting(name) for name in options}
     for name, value in options.items():
         jax.config.update(name, value)
@@ -74,11 +73,7 @@ def kept_programs() -> Iterator[None]:
 
 @contextmanager
 def watched_compilation() -> Iterator[Callable[[], bool]]:
-    """Watch what is compiled in this context.
-
-    Yields:
-        A function that tells whether all of it was read from the cache.
-    """
+    """Yield a function that tells whether all that was compiled meanwhile came from the cache."""
     seen: Counter[str] = Counter()
 
     def note(event: str, **_: object) -> None:
@@ -91,29 +86,24 @@ def watched_compilation() -> Iterator[Callable[[], bool]]:
         jax.monitoring.unregister_event_listener(note)
 
 
-def _is_decided() -> bool:
-    """Whether the user has decided otherwise: against a cache, or for one of JAX's own."""
-    if os.environ.get(VARIABLE, "").strip().lower() == "off":
-        return True
-    is_on = _setting("jax_enable_compilation_cache")
-    return bool(_setting("jax_compilation_cache_dir")) or not is_on
-
-
-def _setting(name: str) -> object:
+def _setting(name: str) -> Any:
     return getattr(jax.config, name)
 
 
-def _open_folder() -> Path | None:
+def _open_folder(chosen: str) -> Path | None:
     """The folder, made where it is missing and tidied; None, and a line why, if it is no use."""
     try:
-        folder = _folder().resolve()
+        caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        if not chosen and not caches.is_absolute():  # Unset, or what XDG says to ignore.
+            caches = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+        folder = Path(chosen).expanduser() if chosen else caches / "sqn_jax" / "compiled"
+        folder = folder.resolve()
         for each in (*reversed(folder.parents), folder):
             each.mkdir(mode=0o700, exist_ok=True)
         fault = _danger(folder)
         if fault is None:
             probe_writable(folder)
-            _delete_damaged(folder)
-            _delete_oldest(folder, LARGEST_BYTES)
+            _tidy(folder)
             return folder
     except OSError as error:
         fault = f"{error.filename}: {error.strerror}" if error.filename else str(error)
@@ -123,19 +113,8 @@ def _open_folder() -> Path | None:
     return None
 
 
-def _folder() -> Path:
-    """Where programs are to be kept."""
-    chosen = os.environ.get(VARIABLE, "").strip()
-    if chosen:
-        return Path(chosen).expanduser()
-    caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not caches.is_absolute():  # Unset, or what its specification says to ignore.
-        caches = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
-    return caches / "sqn_jax" / "compiled"
-
-
 def _danger(folder: Path) -> str | None:
-    """Who else could put programs there, in words; None if nobody."""
+    """Who else could put programs there; None if nobody."""
     if folder.stat().st_uid != os.geteuid():
         return f"{folder} belongs to somebody else"
     for each in (folder, *folder.parents):
@@ -147,57 +126,36 @@ def _danger(folder: Path) -> str | None:
     return None
 
 
-def _delete_damaged(folder: Path) -> None:
-    """Delete entries that are not what was written, and say how many.
+def _tidy(folder: Path) -> None:
+    """Delete programs that are not what was written, and the oldest beyond `LARGEST_BYTES`.
 
-    JAX reads whatever it finds. An entry cut short it notices; but where it compresses by
-    Zstandard, which keeps no checksum, a single wrong bit ends in a crash or in wrong numbers. An
-    entry without a seal was not finished, one it cannot read would not be replaced.
+    JAX runs what it reads. Where it compresses by Zstandard (from Python 3.14 on, or where that
+    package is installed), which keeps no checksum, one wrong bit in seven crashes the process or
+    gives wrong numbers. JAX's own limit needs another package, and fails for good once a process
+    was killed between an entry and its time stamp.
     """
-    damaged = 0
-    for entry in folder.glob(f"*{ENTRY}"):
-        with suppress(OSError):  # Another run may be tidying up too.
-            seal = _seal_of(entry)
-            is_sealed = seal.exists()
-            if not is_sealed or seal.read_bytes() != _digest(entry):
-                damaged += is_sealed
-                entry.unlink(missing_ok=True)
-                seal.unlink(missing_ok=True)
+    room, damaged = LARGEST_BYTES, 0
+    entries = folder.glob(f"*{ENTRY}")
+    for entry in sorted(entries, key=lambda each: each.stat().st_mtime, reverse=True):
+        seal = _seal_of(entry)
+        is_sealed = seal.exists()  # Else a process was killed before it was finished.
+        is_sound = is_sealed and seal.read_bytes() == _digest(entry)
+        damaged += is_sealed and not is_sound
+        room -= entry.stat().st_size if is_sound else 0
+        if not is_sound or room < 0:
+            entry.unlink(missing_ok=True)
+            seal.unlink(missing_ok=True)
     if damaged:
-        print(
-            f"compiled programs in {folder}: {damaged} damaged, deleted (to be compiled again)",
-            file=sys.stderr,
-        )
-
-
-def _delete_oldest(folder: Path, largest: int) -> None:
-    """Delete files, the oldest first, until the rest take no more than `largest` bytes.
-
-    JAX has a limit of its own, which needs another package and a lock around every access.
-    """
-    files = []
-    for path in folder.rglob("*"):  # On a GPU, folders of XLA's too.
-        with suppress(OSError):
-            found = path.lstat()
-            if stat.S_ISREG(found.st_mode):
-                files.append((found.st_mtime, found.st_size, path))
-    total = sum(size for _, size, _ in files)
-    for _, size, path in sorted(files):
-        if total <= largest:
-            break
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        total -= size
+        told = f"compiled programs in {folder}: {damaged} damaged, to be compiled again"
+        print(told, file=sys.stderr)
 
 
 @contextmanager
 def _sealed(folder: Path) -> Iterator[None]:
-    """Put a checksum beside every entry, as soon as it is written."""
+    """Put a checksum beside every program as soon as it is written: the run may be killed."""
 
-    def seal(event: str = "", *_: object, **__: object) -> None:
-        if event and event != "/jax/core/compile/backend_compile_duration":
-            return
-        for entry in folder.glob(f"*{ENTRY}"):
+    def seal(event: str, *_: object, **__: object) -> None:
+        for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
             with suppress(OSError):
                 if not _seal_of(entry).exists():
                     _seal_of(entry).write_bytes(_digest(entry))
@@ -207,11 +165,10 @@ def _sealed(folder: Path) -> Iterator[None]:
         yield
     finally:
         jax.monitoring.unregister_event_duration_listener(seal)
-        seal()
 
 
 def _seal_of(entry: Path) -> Path:
-    return entry.with_name(entry.name.removesuffix(ENTRY) + SEAL)
+    return entry.with_name(entry.name.removesuffix(ENTRY) + "-sha256")
 
 
 def _digest(path: Path) -> bytes:
@@ -220,32 +177,27 @@ def _digest(path: Path) -> bytes:
 
 @contextmanager
 def _told_in_one_line(folder: Path) -> Iterator[None]:
-    """Tell of the first entry that cannot be read or written, and delete each such entry."""
-    told: set[str] = set()
+    """Tell of the first program that JAX cannot read or write, and delete what there is of each."""
+    troubles: set[str] = set()
     with warnings.catch_warnings():
         show_others = warnings.showwarning
 
-        def show(message: Warning | str, *rest: object, **named: object) -> None:
+        def show(message: Warning | str, *rest: Any, **named: Any) -> None:
             trouble = _TROUBLE.match(str(message))
             if trouble is None:
-                show_others(message, *rest, **named)  # type: ignore[arg-type]
+                show_others(message, *rest, **named)
                 return
-            verb, program, reason = trouble.group("verb", "program", "reason")
+            verb, program, reason = trouble.groups()
             with suppress(OSError):  # The folder itself may be gone.
-                for path in folder.iterdir():
-                    if path.name.startswith(f"{program}-"):
-                        path.unlink(missing_ok=True)
-            if verb not in told:
-                reason = " ".join(reason.split())
+                for path in folder.glob(f"{program}-*"):
+                    path.unlink(missing_ok=True)
+            if verb not in troubles:
+                told = f"{verb} {program} failed ({' '.join(reason.split())})"
                 # Through tqdm, since a progress bar may be on the screen.
-                tqdm.write(
-                    f"compiled programs in {folder}: {verb} {program} failed ({reason}); "
-                    "the run goes on without it",
-                    file=sys.stderr,
-                )
-            told.add(verb)
+                tqdm.write(f"compiled programs in {folder}: {told}; going on", file=sys.stderr)
+            troubles.add(verb)
 
-        warnings.showwarning = show  # type: ignore[assignment]
+        warnings.showwarning = show
         # Every time, and never as an error, whatever filters the user has set.
         warnings.filterwarnings("always", message="Error .* persistent compilation cache entry")
         yield

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import compiling_quickly
+from lattice_oracle import HEADINGS, oracle_steps
 
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.baselines.bug import BugNavigator
 from sqn_jax.baselines.oracle import BeamSearch, Oracle
-from sqn_jax.baselines.shortest_paths import HEADINGS, Ways, oracle_steps, shortest_ways
+from sqn_jax.baselines.shortest_paths import ShortestPaths, shortest_path_lengths
 from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import EnvParams, make_env, reset, reset_to, step
 from sqn_jax.env.dynamics import move
@@ -197,8 +198,8 @@ def test_oracle_reaches_a_goal_from_every_point_of_a_map(name: str) -> None:
         if arrived.all():
             break
     assert arrived.all(), points[~arrived]
-    ways = shortest_ways(occupancy_map, poses, goals, robot_radius=0.1)
-    assert success_weighted_path_length(arrived, length, ways).mean() > 0.98
+    shortest = shortest_path_lengths(occupancy_map, poses, goals, robot_radius=0.1)
+    assert success_weighted_path_length(arrived, length, shortest).mean() > 0.98
 
 
 def away(points: np.ndarray, here: np.ndarray) -> np.ndarray:
@@ -241,16 +242,16 @@ def test_what_the_plan_allows_the_simulator_grants(maze: tuple[OccupancyMap, Env
         assert np.mean(~clear & ~np.asarray(refused)) < 0.02
 
 
-def test_ways_know_distance_direction_and_bends() -> None:
+def test_shortest_paths_know_distance_direction_and_bends() -> None:
     corner = room(6, 6, [(1, 1), (5, 5)], (0.05, 4.0, 2.0, 6.0))
     free = traversable(corner.occupied, 0.05, 0.1)
-    ways = Ways(free, 0.05, np.array([[5.025, 5.025], [5.025, 1.025]]), np.pi / 10)
+    paths = ShortestPaths(free, 0.05, np.array([[5.025, 5.025], [5.025, 1.025]]), np.pi / 10)
     # Down the corridor: the first goal is round the corner, the second straight ahead.
     pose = np.array([[1.025, 1.025, 0.0], [1.025, 1.025, np.pi], [5.025, 3.025, np.pi / 2]])
-    left = ways.steps_left(np.array([1, 1, 0]), pose, 0.25, 0.125)
+    left = paths.steps_left(np.array([1, 1, 0]), pose, 0.25, 0.125)
     np.testing.assert_allclose(left, [16, 26, 8], atol=0.1)
-    bent = ways.steps_left(np.array([0]), pose[:1], 0.25, 0.125)[0]
-    length = ways.length[ways.which[0], ways.index[20, 20]]
+    bent = paths.steps_left(np.array([0]), pose[:1], 0.25, 0.125)[0]
+    length = paths.length[paths.which[0], paths.index[20, 20]]
     assert bent > length / 0.25 + 3
 
 

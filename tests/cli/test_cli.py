@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sqn_jax import cli
 from sqn_jax.cli import main
 from sqn_jax.runs import train
 from sqn_jax.storage.run_folder import RunFolder
@@ -152,28 +151,6 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
         "trajectories_evaluation_points.png",
         "trajectories_random_pairs.png",
     ]
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_anywhere_is_one_line_and_its_exit_code(
-    number: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is on its way up may clean up, and afterwards signals are what they were."""
-    cleaned: list[bool] = []
-
-    def hit(words: list[str]) -> int:
-        try:
-            os.kill(os.getpid(), number)
-            raise AssertionError("not stopped")
-        finally:
-            cleaned.append(True)
-
-    monkeypatch.setitem(cli._COMMANDS, "map", hit)
-    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
-    assert main(["map", "check", "maze"]) == 128 + number
-    assert capsys.readouterr().err.strip() == f"sqn: stopped by {number.name}"
-    assert cleaned == [True]
-    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 def test_a_damaged_line_of_metrics_is_named_and_a_half_written_last_one_left_out(

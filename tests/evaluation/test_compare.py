@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sqn_jax.baselines.shortest_paths import shortest_ways
+from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.evaluation.compare import (
@@ -134,7 +134,7 @@ def test_references_have_the_robot_of_the_first_agent() -> None:
     assert num_episodes(agents, Settings(maps=("maze", "cave"), episodes=7)) == 3 * 2 * 5 * 7
 
 
-def test_the_shortest_ways_are_read_off_each_goal_s_own_field(
+def test_the_shortest_paths_are_read_off_each_goal_s_own_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     occupancy_map = load_map("maze")
@@ -144,7 +144,7 @@ def test_the_shortest_ways_are_read_off_each_goal_s_own_field(
     starts = np.concatenate([places, np.zeros((7, 1))], axis=1)
     # Two fields at a time, so that the last batch is not full.
     monkeypatch.setattr("sqn_jax.maps.distance.FIELD_CELLS", 2 * 340 * 340)
-    found = shortest_ways(occupancy_map, starts, goals, robot_radius=0.1)
+    found = shortest_path_lengths(occupancy_map, starts, goals, robot_radius=0.1)
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, 0.1)
     for episode in range(7):
         field = goal_distance(free, occupancy_map.resolution, goals[episode])

@@ -9,11 +9,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from lattice_oracle import steps_between
 from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standing_room
 from numpy.typing import NDArray
 from scipy import ndimage, spatial
 
-from sqn_jax.baselines.shortest_paths import steps_between
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map
 
 NAMES = ("column", "forest", "cave")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lattice_oracle import steps_between
 from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standing_room
 from scipy import ndimage, spatial
 
-from sqn_jax.baselines.shortest_paths import steps_between
 from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps import load_map, validate
 from sqn_jax.maps.generate import generate

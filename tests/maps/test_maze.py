@@ -9,9 +9,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from lattice_oracle import oracle_steps
 from PIL import Image
 
-from sqn_jax.baselines.shortest_paths import oracle_steps
 from sqn_jax.maps import (
     OccupancyMap,
     connected_components,

@@ -11,6 +11,7 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from typing import Any
 import pytest
 from tiny_runs import TinyRuns, wait_for
 
-from sqn_jax.runs import final_evaluation, train
+from sqn_jax.runs import train
 
 
 @pytest.fixture(scope="module")
@@ -95,46 +96,56 @@ def test_a_run_killed_thirty_times_ends_in_the_same_bits(tmp_path: Path, method:
 
 def assert_stopped(runs: TinyRuns, run: str, number: int, code: int, err: str) -> None:
     assert code == 128 + number, err
-    assert f"sqn: stopped by {signal.Signals(number).name}" in err
-    assert f"go on with `sqn train --run-dir {runs.folder / run} --resume --num-devices 1`" in err
+    assert f"sqn: stopped by {signal.Signals(number).name} after saving" in err
+    assert go_on(runs, run) in err
     assert "Traceback" not in err
     assert not (runs.folder / run / "summary.json").exists()
 
 
+def go_on(runs: TinyRuns, run: str) -> str:
+    return f"go on with `sqn train --run-dir {runs.folder / run} --resume --num-devices 1`"
+
+
+def end_at_once(process: subprocess.Popen[str], upon: str, number: signal.Signals) -> str:
+    """Send a signal once a process has said something; returns what it had said until then."""
+    assert process.stdout is not None
+    out = ""
+    while not out.endswith(upon):
+        out += process.stdout.read(1)
+    process.send_signal(number)
+    sent = time.monotonic()
+    _, err = process.communicate(timeout=100)
+    assert time.monotonic() - sent < 5
+    assert process.returncode == -number  # 128 + number, as a shell sees it.
+    assert "Traceback" not in err
+    return out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_compilation_ends_a_run_that_starts_again_from_the_beginning(
-    tiny: TinyRuns,
+    tiny: TinyRuns, number: signal.Signals
 ) -> None:
-    with tiny.start("compiling") as process:
-        assert process.stdout is not None
-        told = ""
-        while not told.endswith("compiling"):
-            told += process.stdout.read(1)
-        process.send_signal(signal.SIGTERM)
-        sent = time.monotonic()
-        _, err = process.communicate(timeout=100)
-        assert time.monotonic() - sent < 15  # `GRACE`, on a slow machine.
-    assert_stopped(tiny, "compiling", signal.SIGTERM, process.returncode, err)
-    assert tiny.saved("compiling") == []
-    code, out, err = tiny.call("compiling", resume=True)
+    run = f"compiling{number}"
+    with tiny.start(run) as process:
+        out = end_at_once(process, "compiling ...", number)
+    assert f"if it is stopped, {go_on(tiny, run)}\n" in out
+    assert tiny.saved(run) == []
+    code, out, err = tiny.call(run, resume=True)
     assert code == 0, err
     assert "starting from the beginning" in out
-    tiny.assert_equal("compiling", "straight")
+    tiny.assert_equal(run, "straight")
 
 
-def test_a_signal_in_the_evaluation_leaves_a_trained_run_to_be_evaluated(
-    tiny: TinyRuns, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    evaluate = final_evaluation.evaluate_agents
-
-    def signalled(*args: Any, **kwargs: Any) -> Any:
-        os.kill(os.getpid(), signal.SIGTERM)
-        return evaluate(*args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(final_evaluation, "evaluate_agents", signalled)
-        code, _, err = tiny.call("evaluating")
-    assert_stopped(tiny, "evaluating", signal.SIGTERM, code, err)
-    assert max(tiny.saved("evaluating")) == tiny.chunks
+def test_a_signal_in_the_evaluation_leaves_a_trained_run_to_be_evaluated(tiny: TinyRuns) -> None:
+    with tiny.start("evaluating") as process:
+        wait_for(lambda: max(tiny.saved("evaluating"), default=0) == tiny.chunks)
+        time.sleep(0.3)  # It closes its bar.
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=100)
+    assert process.returncode == -signal.SIGTERM, err
+    assert go_on(tiny, "evaluating") in out
+    assert "Traceback" not in err
+    assert not (tiny.folder / "evaluating" / "summary.json").exists()
     code, out, err = tiny.call("evaluating", resume=True)
     assert code == 0, err
     assert "compil" not in out  # There is nothing to train.
@@ -158,8 +169,8 @@ def test_a_signal_at_a_random_time_and_a_resumed_run_is_the_same(
             time.sleep(rng.uniform(0.2, 1.0) * whole)
             process.send_signal(number)
             _, err = process.communicate(timeout=100)
-        assert process.returncode in (0, -number, 128 + number), err  # Before Python is up: -n.
-        assert "Traceback" not in err or process.returncode == -number
+        assert process.returncode in (0, -number, 128 + number), err  # -n: where nothing is lost.
+        assert "Traceback" not in err or not (runs.folder / run / "config.json").exists()
         if (runs.folder / run / "config.json").exists():
             runs.finish(run, resume=True)
             runs.assert_equal(run, "straight")

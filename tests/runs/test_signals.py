@@ -7,218 +7,193 @@ import pty
 import signal
 import subprocess
 import sys
-import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from sqn_jax.runs.signals import Interrupted, collected, interruptible, last_words, say_stopped
+from sqn_jax.runs.signals import Interrupted, deferred
 
-# A loop in Python hears of a signal at once; what is compiled not before it has ended.
-IN_PYTHON = "while True: time.sleep(0.01)"
-IN_COMPILED_CODE = "hashlib.pbkdf2_hmac('sha256', b'x', b'x', 500_000_000)"
+STOPPING = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 # Whoever runs the tests may have ignored SIGHUP, as nohup does, and children inherit that.
-HEED_HANGUP = """
-import signal
+PROGRAM = """
+import hashlib, os, signal, sys, time
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
-"""
-
-PROGRAM = (
-    HEED_HANGUP
-    + """
-import hashlib, sys, time
-from sqn_jax.runs import signals
-from sqn_jax.runs.signals import Interrupted, collected, interruptible, last_words, say_stopped
-signals.GRACE = {grace}
+import jax, jax.numpy as jnp
+from sqn_jax.runs.signals import Interrupted, deferred, end_at_once, wait_for
+end_at_once()
 try:
-    with interruptible("sqn"), last_words("go on with this"):
-        print("ready", flush=True)
-        {body}
+    {body}
 except Interrupted as stop:
-    say_stopped(stop.signal)
-    print("in order", flush=True)
+    print(stop, file=sys.stderr)
     sys.exit(stop.exit_code)
 """
-)
+
+# Neither C code of Python's nor a program of XLA's lets Python's handlers run.
+IN_COMPILED_CODE = """
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac('sha256', b'x', b'x', 500_000_000)
+"""
+IN_A_CHUNK = """
+    chunk = jax.jit(lambda x: jax.lax.fori_loop(0, {steps}, lambda i, c: jnp.sin(c) @ c, x))
+    chunk = chunk.lower(jnp.ones((64, 64))).compile()
+    with deferred("stopping after this chunk and saving") as received:
+        result = chunk(jnp.ones((64, 64)))
+        print("ready", flush=True)
+        wait_for(result)
+        print("saved", flush=True)
+    if received:
+        raise Interrupted(received[0], "this command")
+"""
+NEVER, SOON = 10**9, 150_000
+"""Steps of a chunk: longer than any test waits, and a second or so."""
+TOLD = "stopping after this chunk and saving; once more to stop at once"
 
 
 class Child:
-    """A process that has said it is ready; use as a context manager, which leaves none behind."""
+    """A process, its exit status as a shell tells it; it has said that it is ready."""
 
-    def __init__(self, body: str, grace: float = 0.3) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM.format(body=body, grace=grace)],
+    def __init__(self, body: str) -> None:
+        program = PROGRAM.format(body=body.strip())
+
+        self.shell = subprocess.Popen(
+            ["sh", "-c", '"$0" -c "$1"; echo "status $?"', sys.executable, program],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
-        assert self.process.stderr is not None
-        assert self.process.stdout.readline() == "ready\n"
+        assert self.shell.stdout is not None
+        assert self.shell.stdout.readline() == "ready\n"
+        children = Path(f"/proc/{self.shell.pid}/task/{self.shell.pid}/children")
+        self.pid = int(children.read_text().split()[0])
         time.sleep(0.1)
 
-    def __enter__(self) -> Child:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.communicate()
-
     def send(self, number: int) -> None:
-        self.process.send_signal(number)
+        os.kill(self.pid, number)
 
-    def told(self) -> str:
+    def runs(self) -> bool:
+        return self.shell.poll() is None
+
+    def next_line(self) -> str:
         """The next line on stderr that is not empty."""
         line = ""
         while not line:
-            line = self.process.stderr.readline().strip()  # type: ignore[union-attr]
+            line = self.shell.stderr.readline().strip()  # type: ignore[union-attr]
         return line
 
     def end(self) -> tuple[int, str, str]:
-        self.process.wait(timeout=60)
-        assert self.process.stdout is not None
-        assert self.process.stderr is not None
-        return self.process.returncode, self.process.stdout.read(), self.process.stderr.read()
+        """Exit status, the rest of stdout and of stderr."""
+        out, err = self.shell.communicate(timeout=60)
+        out, _, status = out.rpartition("status ")
+        return int(status), out, err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_in_python_ends_in_order(number: signal.Signals) -> None:
-    with Child(IN_PYTHON) as child:
-        child.send(number)
-        code, out, err = child.end()
-        assert (code, out) == (128 + number, "in order\n")
-        assert err == f"\nsqn: stopped by {number.name}\ngo on with this\n"
+@contextmanager
+def started(body: str) -> Iterator[Child]:
+    child = Child(body)
+    try:
+        yield child
+    finally:
+        if child.runs():
+            child.send(signal.SIGKILL)
+            child.shell.communicate()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@linux
+@pytest.mark.parametrize("number", STOPPING)
 def test_compiled_code_is_not_waited_for_where_nothing_is_to_be_saved(
     number: signal.Signals,
 ) -> None:
-    with Child(IN_COMPILED_CODE) as child:
+    with started(IN_COMPILED_CODE) as child:
         sent = time.monotonic()
         child.send(number)
-        code, out, err = child.end()
-        assert (code, out) == (128 + number, "")
-        assert err == f"\nsqn: stopped by {number.name}\ngo on with this\n"
-        assert 0.25 < time.monotonic() - sent < 10
+        status, out, err = child.end()
+        assert (status, out) == (128 + number, "")
+        assert "Traceback" not in err
+        assert time.monotonic() - sent < 5
 
 
-IN_A_CALLBACK = """
-        import gc
-        gc.callbacks.append(lambda phase, info: time.sleep(0.01))
-        while True:
-            gc.collect()
-            time.sleep(0.005)
-"""
+@linux
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_chunk_is_waited_for_and_the_user_told_at_once(number: signal.Signals) -> None:
+    with started(IN_A_CHUNK.format(steps=SOON)) as child:
+        child.send(number)
+        assert child.next_line() == TOLD
+        assert child.runs()
+        status, out, err = child.end()
+        assert (status, out) == (128 + number, "saved\n")
+        assert err == f"stopped by {number.name} after saving, go on with this command\n"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_that_gets_lost_in_a_callback_is_raised_again(number: signal.Signals) -> None:
-    """Python prints what the garbage collector's callbacks raise, and goes on."""
-    for _ in range(2):
-        with Child(IN_A_CALLBACK.strip(), grace=1000) as child:
-            child.send(number)
-            code, out, err = child.end()
-            assert (code, out) == (128 + number, "in order\n")
-            assert err == f"\nsqn: stopped by {number.name}\ngo on with this\n"
-
-
-def test_a_second_signal_ends_at_once() -> None:
-    with Child(IN_COMPILED_CODE, grace=1000) as child:
-        child.send(signal.SIGTERM)
-        time.sleep(0.3)
-        assert child.process.poll() is None
+@linux
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_while_a_chunk_is_waited_for_a_second_signal_ends_at_once(number: signal.Signals) -> None:
+    with started(IN_A_CHUNK.format(steps=NEVER)) as child:
         child.send(signal.SIGINT)
-        code, _, err = child.end()
-        assert code == 130
-        assert "stopped at once by SIGINT" in err
+        assert child.next_line() == TOLD
+        child.send(number)
+        assert child.end()[:2] == (128 + number, "")
 
 
-COLLECT = """
-        with collected("stopping after this chunk and saving") as received:
-            print("collecting", flush=True)
-            hashlib.pbkdf2_hmac('sha256', b'x', b'x', {rounds})
-            print(received, flush=True)
-        if received:
-            raise Interrupted(received[0])
-"""
-
-
-def test_what_is_to_be_saved_is_waited_for_and_the_user_told_at_once() -> None:
-    with Child(COLLECT.strip().format(rounds=4_000_000), grace=0.05) as child:
-        assert child.process.stdout.readline() == "collecting\n"  # type: ignore[union-attr]
-        time.sleep(0.1)
-        child.send(signal.SIGTERM)
-        assert child.told() == "stopping after this chunk and saving; once more to stop at once"
-        assert child.process.poll() is None
-        code, out, err = child.end()
-        assert (code, out) == (143, f"[{signal.SIGTERM:d}]\nin order\n")
-        assert err == "\nsqn: stopped by SIGTERM\ngo on with this\n"
-
-
-def test_while_it_is_waited_for_a_second_signal_ends_at_once() -> None:
-    with Child(COLLECT.strip().format(rounds=500_000_000)) as child:
-        assert child.process.stdout.readline() == "collecting\n"  # type: ignore[union-attr]
-        time.sleep(0.1)
+@linux
+def test_a_terminal_that_closes_says_so_twice_and_even_after_ctrl_c_cuts_nothing_off() -> None:
+    with started(IN_A_CHUNK.format(steps=3 * SOON)) as child:
         child.send(signal.SIGINT)
-        assert child.told() == "stopping after this chunk and saving; once more to stop at once"
-        child.send(signal.SIGINT)
-        code, out, err = child.end()
-        assert (code, out) == (130, "")
-        assert "stopped at once by SIGINT" in err
+        assert child.next_line() == TOLD
+        for _ in range(2):
+            child.send(signal.SIGHUP)
+            time.sleep(0.05)
+        assert child.end()[:2] == (130, "saved\n")
 
 
-WITHOUT_TERMINAL = (
-    HEED_HANGUP
-    + """
-import fcntl, os, sys, termios, time
-from sqn_jax.runs.signals import collected, interruptible
+WITHOUT_TERMINAL = """
+import fcntl, signal, sys, termios, time
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+from sqn_jax.runs.signals import deferred
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # the terminal is this session's: closing it hangs it up
-with interruptible("sqn"), collected("saving") as received:
+with deferred("saving") as received:
     print("ready", flush=True)
     while not received:
         time.sleep(0.01)
     time.sleep(0.2)
-    print("a line to a terminal that is gone", file=sys.stderr, flush=True)
+    for stream in (sys.stdout, sys.stderr):
+        print("a line to a terminal that is gone", file=stream, flush=True)
     with open(sys.argv[1], "w") as file:
-        file.write(f"saved after {received}")
+        file.write(f"saved after {received[0]:d}")
 """
-)
 
 
-def start_on_terminal(saved: Path) -> tuple[subprocess.Popen[bytes], int]:
-    """The program above as the first process of a terminal of its own, which is returned, too."""
+def test_a_terminal_that_is_closed_does_not_keep_from_saving(tmp_path: Path) -> None:
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-c", WITHOUT_TERMINAL, str(saved)],
+        [sys.executable, "-c", WITHOUT_TERMINAL, str(tmp_path / "saved")],
         stdin=slave,
         stdout=slave,
         stderr=slave,
         start_new_session=True,
     )
-    os.close(slave)
-    told = b""
-    while b"ready" not in told:
-        told += os.read(master, 100)
-    return process, master
-
-
-def test_a_terminal_that_is_closed_does_not_keep_from_saving(tmp_path: Path) -> None:
-    process, terminal = start_on_terminal(tmp_path / "saved")
-    os.close(terminal)
     try:
+        os.close(slave)
+        told = b""
+        while b"ready" not in told:
+            told += os.read(master, 100)
+        os.close(master)
         assert process.wait(timeout=60) == 0
     finally:
         process.kill()
-    assert (tmp_path / "saved").read_text() == f"saved after [{signal.SIGHUP:d}]"
+    assert (tmp_path / "saved").read_text() == f"saved after {signal.SIGHUP:d}"
 
 
 def test_what_was_started_to_go_on_without_a_terminal_goes_on() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with interruptible(), collected("saving") as received:
+        with deferred("saving") as received:
             os.kill(os.getpid(), signal.SIGHUP)
         assert received == []
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -226,29 +201,17 @@ def test_what_was_started_to_go_on_without_a_terminal_goes_on() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_afterwards_signals_are_what_they_were() -> None:
-    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
-    threads = threading.active_count()
-    with interruptible():
-        with collected("saving") as received:
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(0.05)
-        assert received == [signal.SIGTERM]
-    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
-    assert signal.set_wakeup_fd(-1) == -1
-    assert threading.active_count() == threads
+def test_afterwards_signals_are_what_they_were(capfd: pytest.CaptureFixture[str]) -> None:
+    before = [signal.getsignal(each) for each in STOPPING]
+    with deferred("saving") as received:
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert received == [signal.SIGTERM]
+    assert [signal.getsignal(each) for each in STOPPING] == before
+    assert capfd.readouterr().err == "\nsaving; once more to stop at once\n"
 
 
-def test_last_words_are_those_of_the_command_that_was_stopped(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(ValueError, match="other"), last_words("first"):
-        raise ValueError("other")
-    with last_words("second"):
-        pass
-    say_stopped(signal.SIGINT)
-    assert capsys.readouterr().err == "\nsqn: stopped by SIGINT\n"
-    with pytest.raises(Interrupted), last_words("third"):
-        raise Interrupted(signal.SIGTERM)
-    say_stopped(signal.SIGTERM)
-    assert capsys.readouterr().err == "\nsqn: stopped by SIGTERM\nthird\n"
+def test_who_was_interrupted_says_by_what_and_how_to_go_on() -> None:
+    stop = Interrupted(signal.SIGTERM, "`this`")
+    assert stop.exit_code == 143
+    assert str(stop) == "stopped by SIGTERM after saving, go on with `this`"
+    assert str(Interrupted(signal.SIGINT)) == "stopped by SIGINT after saving"

@@ -1,4 +1,4 @@
-"""Oracle steps by hand arithmetic, by a plain search, and by driving the steps they promise."""
+"""The lattice oracle that other tests compare with: by hand arithmetic and by a plain search."""
 
 from __future__ import annotations
 
@@ -6,14 +6,8 @@ from collections import deque
 
 import numpy as np
 import pytest
+from lattice_oracle import HEADINGS, UNREACHABLE, move_offsets, oracle_steps, steps_between
 
-from sqn_jax.baselines.shortest_paths import (
-    HEADINGS,
-    UNREACHABLE,
-    move_offsets,
-    oracle_steps,
-    steps_between,
-)
 from sqn_jax.maps import OccupancyMap
 
 NO_POINTS = np.empty((0, 2))
