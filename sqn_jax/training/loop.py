@@ -34,7 +34,7 @@ from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shares import mean, own_share
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.training.devices import AXIS, compiler_options, place, placed_shapes
+from sqn_jax.training.devices import AXIS, place, placed_shapes
 from sqn_jax.training.rollout import (
     Fleet,
     Trace,
@@ -353,7 +353,7 @@ def compile_chunk(
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), mesh)
     runner = runner_shapes(env_params, config, mesh)
     lowered = _jitted_train_chunk.lower(runner, world, config, mesh)
-    program = lowered.compile(compiler_options=compiler_options(config))
+    program = lowered.compile()
     return program, time.perf_counter() - started
 
 
