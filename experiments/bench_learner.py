@@ -41,7 +41,6 @@ Name = tuple[str, str]
 
 PRODUCT = "matrix product"
 JAX, SAMPLING = "JAX", "JAX, with sampling"
-JAX_AS_TRAINED = "JAX, with the options of training"
 STORED_BATCHES = 4
 """The replay that is drawn from holds this many times an update's episodes."""
 
@@ -143,8 +142,7 @@ def _scan(update: Any, program: Program, state: Any, inputs: Any, outputs: Any) 
             out_specs=(state, outputs),
             check_vma=False,
         )
-    options = devices.compiler_options(program.config)
-    return jax.jit(scan, donate_argnums=0, compiler_options=options)
+    return jax.jit(scan, donate_argnums=0)
 
 
 def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Timed:
@@ -159,18 +157,11 @@ def _carried_on(update: Callable[[Any, int], tuple[Any, Any]], state: Any) -> Ti
     return next_updates
 
 
-def product_programs(size: int, options: dict[str, str | bool]) -> dict[Name, Timed]:
-    """A product of two float32 matrices [size, size] in JAX, compiled as usual and with options."""
+def product_program(size: int) -> Timed:
+    """A product of two float32 matrices [size, size] in JAX."""
     left, right = jax.random.normal(jax.random.key(0), (2, size, size))
-
-    def program(**how: Any) -> Timed:
-        multiply = jax.jit(jnp.matmul, **how)
-        return lambda turn: multiply(left, right)
-
-    found: dict[Name, Timed] = {(PRODUCT, JAX): program()}
-    if options:
-        found[PRODUCT, JAX_AS_TRAINED] = program(compiler_options=options)
-    return found
+    multiply = jax.jit(jnp.matmul)
+    return lambda turn: multiply(left, right)
 
 
 def torch_programs(
@@ -281,8 +272,7 @@ def measure(
         algo: make_problem(dataclasses.replace(config, algo=algo), env_params, num_updates)
         for algo in algos
     }
-    options = devices.compiler_options(dataclasses.replace(config, method="r2d2"))
-    programs = product_programs(product_size, options)
+    programs: dict[Name, Timed] = {(PRODUCT, JAX): product_program(product_size)}
     for algo, problem in problems.items():
         for mesh in devices.one_and_all():
             suffix = "" if mesh is None else f", {mesh.size} devices"

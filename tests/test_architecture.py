@@ -33,7 +33,7 @@ QUIET_CALLS = {
 PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING = ("sqn_jax/figures/", "sqn_jax/report/")
 JIT = (
-    *("sqn_jax/training/loop.py", "sqn_jax/training/devices.py"),
+    "sqn_jax/training/loop.py",
     *("sqn_jax/evaluation/episodes.py", "sqn_jax/evaluation/recording.py"),
     *("experiments/bench_simulator.py", "experiments/bench_learner.py"),
     *("experiments/bench_breakdown.py", "experiments/check_gpu.py", "notebooks/01_first_steps.py"),

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from sqn_jax.agent import gru_kernel
-from sqn_jax.agent.linear import Branches, Linear, sum_rows, then
+from sqn_jax.agent.linear import affine, sum_rows
 
 
 class GRU(nn.Module):
@@ -30,11 +30,11 @@ class GRU(nn.Module):
     hidden_size: int
 
     @nn.compact
-    def __call__(self, inputs: Branches, carry: Array) -> tuple[Array, Array]:
+    def __call__(self, inputs: Array, carry: Array) -> tuple[Array, Array]:
         """Run over a sequence.
 
         Args:
-            inputs: [T, B, D], as outputs of linear layers.
+            inputs: [T, B, D] features.
             carry: [B, H] hidden state before the first step.
 
         Returns:
@@ -42,12 +42,12 @@ class GRU(nn.Module):
         """
         size = self.hidden_size
         input_kernel = self.param(
-            "input_kernel", nn.initializers.lecun_normal(), (inputs.size, 3 * size)
+            "input_kernel", nn.initializers.lecun_normal(), (inputs.shape[-1], 3 * size)
         )
         input_bias = self.param("input_bias", nn.initializers.zeros, (3 * size,))
         hidden_kernel = self.param("hidden_kernel", _orthogonal_gates, (size, 3 * size))
         candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (size,))
-        projected = then(inputs, Linear(input_kernel, input_bias))
+        projected = affine(inputs, input_kernel, input_bias)
         hidden = scan_gru(projected, carry, hidden_kernel, candidate_bias)
         return hidden[-1], hidden
 

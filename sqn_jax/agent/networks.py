@@ -6,17 +6,16 @@ the rollout know only this interface; which network runs is a matter of configur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from sqn_jax.agent.gru import GRU
-from sqn_jax.agent.linear import Branches, Linear, affine, apply_each, stacked, then
+from sqn_jax.agent.linear import Dense
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -45,90 +44,49 @@ class QOutput:
     """Output of a network for T steps of B robots, A actions and K skills (K is 1 without)."""
 
     q_values: Array
-    """[T, B, A] action values; with value rescaling, of h(Q)."""
+    """[T, B, A] action values (eq. 6); with value rescaling, of h(Q)."""
     skill_weights: Array
     """[T, B, K] the skill decision eta (eq. 4), positive and summing to 1."""
     skill_q_values: Array
     """[T, B, K, A] action values of each skill (eq. 5)."""
 
 
-class Norm(NamedTuple):
-    """Scale and bias [H] after a layer normalisation."""
-
-    scale: Array
-    bias: Array
-
-
-class TwoLayers(NamedTuple):
-    """The parameters of an MLP with one hidden layer."""
-
-    hidden: Linear
-    norm: Norm | None
-    output: Linear
-
-
 class MLP(nn.Module):
-    """Two linear layers with a ReLU in between, optionally layer-normalised before it.
-
-    Only their parameters: heads are computed side by side (`side_by_side`), and so are features.
-    """
+    """Two linear layers with a ReLU in between, optionally layer-normalized before it."""
 
     hidden_size: int
     output_size: int
-    layer_norm: bool
-    output_scale: float = 1.0
-    """Scale of the output layer's initial weights and biases: small for a head, near 0 at first."""
+    layer_norm: bool = False
     input_scale: float = 1.0
     """Scale of the first layer's initial weights and biases."""
+    output_scale: float = 1.0
+    """Scale of the output layer's initial weights and biases: small for a head, near 0 at first."""
 
     @nn.compact
-    def __call__(self, fan_in: int) -> TwoLayers:
-        """The layers for inputs [..., fan_in]."""
-        hidden = _linear(fan_in, self.hidden_size, "hidden", self.input_scale)
-        norm = _Norm(self.hidden_size, name="norm")() if self.layer_norm else None
-        output = _linear(self.hidden_size, self.output_size, "output", self.output_scale)
-        return TwoLayers(hidden, norm, output)
-
-
-def side_by_side(inputs: Array, mlps: Sequence[TwoLayers]) -> Branches:
-    """Several MLPs with the same inputs [..., D], all but their output layers done."""
-    hidden = affine(inputs, *stacked([mlp.hidden for mlp in mlps]))
-    norms = [mlp.norm for mlp in mlps if mlp.norm is not None]
-    if norms:
-        hidden = _normalise(hidden, norms)
-    return Branches(nn.relu(hidden), tuple(mlp.output for mlp in mlps))
-
-
-def _normalise(hidden: Array, norms: Sequence[Norm]) -> Array:
-    """Layer normalisation of each of several layers of equal size side by side, [..., n H]."""
-    groups = hidden.reshape(*hidden.shape[:-1], len(norms), -1)
-    normal = cast(Array, nn.LayerNorm(use_scale=False, use_bias=False).apply({}, groups))
-    shape = (1,) * (hidden.ndim - 1) + groups.shape[-2:]
-    scale, bias = (jnp.stack(each).reshape(shape) for each in zip(*norms, strict=True))
-    return (normal * scale + bias).reshape(hidden.shape)
+    def __call__(self, inputs: Array) -> Array:
+        """Map inputs [T, B, D] to outputs [T, B, E]."""
+        hidden = Dense(self.hidden_size, self.input_scale, name="hidden")(inputs)
+        if self.layer_norm:
+            hidden = nn.LayerNorm(name="norm")(hidden)
+        return Dense(self.output_size, self.output_scale, name="output")(nn.relu(hidden))
 
 
 class Features(nn.Module):
-    """Both observations through an MLP each, side by side (eq. 1): [..., 2 x hidden_size]."""
+    """The features of both observations, each through an MLP of its own (eq. 1)."""
 
-    config: NetworkConfig
+    size: int
 
     @nn.compact
-    def __call__(self, obs: HasObservation) -> Branches:
-        """Map an observation [T, B, ...] to features [T, B, 2 H], all but the last layers done."""
-        size = self.config.hidden_size
-        # Never normalised: over two inputs it would keep their ratio and lose their size.
-        ranges = MLP(size, size, layer_norm=False, name="ranges")(obs.ranges.shape[-1])
-        goal = MLP(size, size, layer_norm=False, input_scale=GOAL_SCALE, name="goal")(
-            obs.goal.shape[-1]
-        )
-        inputs = jnp.concatenate([obs.ranges, obs.goal], axis=-1)
-        hidden = apply_each(inputs, [ranges.hidden, goal.hidden])
-        return Branches(nn.relu(hidden), (ranges.output, goal.output))
+    def __call__(self, obs: HasObservation) -> Array:
+        """Map an observation [T, B, ...] to the features [z_range; z_goal], [T, B, 2 size]."""
+        # Never normalized: over two inputs it would keep their ratio and lose their size.
+        z_range = MLP(self.size, self.size, name="ranges")(obs.ranges)
+        z_goal = MLP(self.size, self.size, input_scale=GOAL_SCALE, name="goal")(obs.goal)
+        return jnp.concatenate([z_range, z_goal], axis=-1)
 
 
 class SkillQNetwork(nn.Module):
-    """The Skill Q-Network (paper eq. 1 to 6): GRU perception, skill decision, N latent skills."""
+    """The Skill Q-Network (eq. 1 to 6): GRU perception, skill decision, K latent skills."""
 
     config: NetworkConfig
     num_actions: int
@@ -136,34 +94,29 @@ class SkillQNetwork(nn.Module):
     @nn.compact
     def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
         """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
-        config = self.config
-        size, norm = config.hidden_size, config.layer_norm
-        features = Features(config, name="features")(obs)
-        carry, perception = GRU(size, name="perception")(features, carry)
-        heads = [("decision", config.num_skills)]
-        heads += [(f"skill_{index}", self.num_actions) for index in range(config.num_skills)]
-        mlps = []  # Each sees the perception plus an embedding of its own.
-        for name, outputs in heads:
-            mlp = MLP(size, outputs, norm, HEAD_SCALE, name=name)(size)
-            mlps.append(mlp._replace(hidden=_shifted(mlp.hidden, self._embedding(name))))
-        told = side_by_side(perception, mlps).outputs()
-        skill_weights = nn.softmax(told[..., : config.num_skills], axis=-1)
-        skill_q_values = told[..., config.num_skills :].reshape(
-            *told.shape[:-1], config.num_skills, self.num_actions
-        )
-        q_values = (skill_weights[..., None] * skill_q_values).sum(axis=-2)
+        size, norm = self.config.hidden_size, self.config.layer_norm
+        num_skills = self.config.num_skills
+        features = Features(size, name="features")(obs)  # eq. 1
+        carry, perception = GRU(size, name="perception")(features, carry)  # eq. 2
+
+        decision = MLP(size, num_skills, norm, output_scale=HEAD_SCALE, name="decision")
+        z_decision = decision(perception + self._embedding("decision"))  # eq. 3
+        skill_weights = nn.softmax(z_decision, axis=-1)  # eq. 4
+
+        each_skill = []
+        for name in [f"skill_{index}" for index in range(num_skills)]:
+            skill = MLP(size, self.num_actions, norm, output_scale=HEAD_SCALE, name=name)
+            each_skill.append(skill(perception + self._embedding(name)))  # eq. 5
+        skill_q_values = jnp.stack(each_skill, axis=-2)
+
+        q_values = (skill_weights[..., None] * skill_q_values).sum(axis=-2)  # eq. 6
         return carry, QOutput(q_values, skill_weights, skill_q_values)
 
     def _embedding(self, name: str) -> Array:
-        """A head's learnable module embedding [H]; small at first, so that it does not drown z."""
+        """The learnable embedding e_mod of a module [1, 1, H]; small, so as not to drown z."""
         shape = (self.config.hidden_size,)
         embedding: Array = self.param(f"{name}_embedding", nn.initializers.normal(0.02), shape)
-        return embedding
-
-
-def _shifted(layer: Linear, embedding: Array) -> Linear:
-    """The layer [D, E] that makes of z what `layer` makes of z + embedding, [D]."""
-    return Linear(layer.kernel, layer.bias + embedding @ layer.kernel)
+        return embedding[None, None]
 
 
 class RecurrentQNetwork(nn.Module):
@@ -176,10 +129,10 @@ class RecurrentQNetwork(nn.Module):
     def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
         """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
         size, norm = self.config.hidden_size, self.config.layer_norm
-        features = Features(self.config, name="features")(obs)
+        features = Features(size, name="features")(obs)
         carry, perception = GRU(size, name="perception")(features, carry)
-        head = MLP(size, self.num_actions, norm, HEAD_SCALE, name="skill_0")(size)
-        return carry, _single_head(side_by_side(perception, [head]).outputs())
+        head = MLP(size, self.num_actions, norm, output_scale=HEAD_SCALE, name="skill_0")
+        return carry, _single_head(head(perception))
 
 
 class FeedForwardQNetwork(nn.Module):
@@ -191,13 +144,22 @@ class FeedForwardQNetwork(nn.Module):
     @nn.compact
     def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
         """Return the carry unchanged and the Q-values for observations [T, B, ...]."""
-        width = self.config.hidden_size * self.config.dqn_width_factor
-        features = Features(self.config, name="features")(obs)
-        hidden = then(features, _linear(features.size, width, "perception"))
-        if self.config.layer_norm:
-            hidden = _normalise(hidden, [_Norm(width, name="norm")()])
-        head = MLP(width, self.num_actions, self.config.layer_norm, HEAD_SCALE, name="skill_0")
-        return carry, _single_head(side_by_side(nn.relu(hidden), [head(width)]).outputs())
+        width, norm = self.config.hidden_size * self.config.dqn_width_factor, self.config.layer_norm
+        features = Features(self.config.hidden_size, name="features")(obs)
+        hidden = Dense(width, name="perception")(features)
+        if norm:
+            hidden = nn.LayerNorm(name="norm")(hidden)
+        head = MLP(width, self.num_actions, norm, output_scale=HEAD_SCALE, name="skill_0")
+        return carry, _single_head(head(nn.relu(hidden)))
+
+
+def _single_head(q_values: Array) -> QOutput:
+    """The output of a network without skills: one that has all the weight."""
+    return QOutput(
+        q_values=q_values,
+        skill_weights=jnp.ones((*q_values.shape[:-1], 1)),
+        skill_q_values=q_values[..., None, :],
+    )
 
 
 QNetwork = SkillQNetwork | RecurrentQNetwork | FeedForwardQNetwork
@@ -217,52 +179,3 @@ def make_network(algo: Algorithm, config: NetworkConfig, num_actions: int) -> QN
 def initial_carry(config: NetworkConfig, batch_size: int) -> Array:
     """The recurrent state [B, H] at the start of an episode: zero."""
     return jnp.zeros((batch_size, config.hidden_size))
-
-
-def _single_head(q_values: Array) -> QOutput:
-    return QOutput(
-        q_values=q_values,
-        skill_weights=jnp.ones((*q_values.shape[:-1], 1)),
-        skill_q_values=q_values[..., None, :],
-    )
-
-
-class _Linear(nn.Module):
-    """The parameters of a linear layer."""
-
-    size: int
-    scale: float
-
-    @nn.compact
-    def __call__(self, fan_in: int) -> Linear:
-        initializer = nn.initializers.variance_scaling(self.scale**2, "fan_in", "truncated_normal")
-        kernel = self.param("kernel", initializer, (fan_in, self.size))
-        return Linear(kernel, self.param("bias", _uniform_bias(fan_in, self.scale), (self.size,)))
-
-
-def _uniform_bias(fan_in: int, scale: float) -> nn.initializers.Initializer:
-    """Biases spread over +-scale / sqrt(fan_in), so that the ReLUs of few inputs bend apart."""
-    bound = scale / fan_in**0.5
-
-    def initialize(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
-        return jax.random.uniform(key, shape, dtype, -bound, bound)
-
-    return initialize
-
-
-def _linear(fan_in: int, size: int, name: str, scale: float = 1.0) -> Linear:
-    """A layer of the module that is being set up, named as a part of it."""
-    layer: Linear = _Linear(size, scale, name=name)(fan_in)
-    return layer
-
-
-class _Norm(nn.Module):
-    """The parameters after a layer normalisation."""
-
-    size: int
-
-    @nn.compact
-    def __call__(self) -> Norm:
-        shape = (self.size,)
-        scale = self.param("scale", nn.initializers.ones, shape)
-        return Norm(scale, self.param("bias", nn.initializers.zeros, shape))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,30 +42,6 @@ def use_cores() -> None:
         jax.config.update("jax_num_cpu_devices", num_cores())
     except RuntimeError:  # The devices are there already.
         return
-
-
-def compiler_options(config: TrainConfig) -> dict[str, str | bool]:
-    """How XLA is to compile the training program of a run for the CPU; nothing for other devices.
-
-    An update of whole episodes (method `r2d2`) takes 8 % less time with products by Eigen than by
-    YNNPACK, jaxlib's default; one of short windows does not. Where XLA does not know the option,
-    which is one of jaxlib 0.10, its default stays, and what the user has set (`XLA_FLAGS`) is left
-    as it is.
-    """
-    wanted: dict[str, str | bool] = {"xla_cpu_experimental_ynn_fusion_type": ""}
-    is_apt = config.method == "r2d2" and jax.default_backend() == "cpu"
-    is_set = any(name in os.environ.get("XLA_FLAGS", "") for name in wanted)
-    return wanted if is_apt and not is_set and _knows(tuple(wanted.items())) else {}
-
-
-@cache
-def _knows(options: tuple[tuple[str, str | bool], ...]) -> bool:
-    """Whether XLA has compiler options of these names and takes these values."""
-    try:
-        jax.jit(lambda x: x).lower(0.0).compile(compiler_options=dict(options))
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
 
 
 def require(kind: str | None) -> None:

@@ -31,7 +31,7 @@ from sqn_jax.agent.shards import mean, own_shard
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
-from sqn_jax.training.devices import compiler_options, place, placed_shapes
+from sqn_jax.training.devices import place, placed_shapes
 from sqn_jax.training.rollout import (
     ActorState,
     episode_metrics,
@@ -238,8 +238,7 @@ def compile_chunk(env_params: EnvParams, program: Program) -> tuple[CompiledChun
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), program.mesh)
     runner = runner_shapes(env_params, program)
-    lowered = _jitted_train_chunk.lower(runner, world, program)
-    compiled = lowered.compile(compiler_options=compiler_options(program.config))
+    compiled = _jitted_train_chunk.lower(runner, world, program).compile()
     return compiled, time.perf_counter() - started
 
 

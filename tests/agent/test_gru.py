@@ -11,7 +11,6 @@ from jax import Array
 from learning_oracle import projected_gru_step
 
 from sqn_jax.agent.gru import GRU, _orthogonal, scan_gru
-from sqn_jax.agent.linear import Branches, Linear
 
 SIZE, BATCH, INPUTS = 3, 2, 4
 ARGUMENTS = ("projected", "carry", "hidden_kernel", "candidate_bias")
@@ -47,12 +46,6 @@ def numpy_scan(projected, carry, hidden_kernel, bias):
     return hidden
 
 
-def as_given(inputs: Array) -> Branches:
-    """Inputs as they are, through a layer that changes nothing."""
-    size = inputs.shape[-1]
-    return Branches(inputs, (Linear(jnp.eye(size), jnp.zeros(size)),))
-
-
 def test_it_equals_the_flax_cell_with_the_same_weights() -> None:
     rng = np.random.default_rng(1)
     inputs = jnp.asarray(rng.normal(size=(6, BATCH, INPUTS)), jnp.float32)
@@ -73,7 +66,7 @@ def test_it_equals_the_flax_cell_with_the_same_weights() -> None:
     theirs["hn"]["bias"] = candidate_bias
     theirs = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), theirs)
 
-    last, hidden = GRU(SIZE).apply({"params": ours}, as_given(inputs), carry)
+    last, hidden = GRU(SIZE).apply({"params": ours}, inputs, carry)
 
     # Flax adds its biases by implicit broadcasting.
     with jax.numpy_rank_promotion("allow"):
@@ -131,8 +124,8 @@ def test_each_gate_starts_orthogonal_as_numpy_s_factorisation_has_it() -> None:
     size = 128
     layer = GRU(size)
     key = jax.random.key(5)
-    given = as_given(jnp.zeros((1, 1, 2)))
-    kernel = layer.init(key, given, jnp.zeros((1, size)))["params"]["hidden_kernel"]
+    inputs, carry = jnp.zeros((1, 1, 2)), jnp.zeros((1, size))
+    kernel = layer.init(key, inputs, carry)["params"]["hidden_kernel"]
     gates = np.split(np.asarray(kernel, np.float64), 3, axis=1)
     for gate in gates:
         np.testing.assert_allclose(gate.T @ gate, np.eye(size), atol=2e-6)
@@ -148,7 +141,7 @@ def test_initialisation_calls_no_factorisation_of_the_library() -> None:
     """Batched over seeds it can wait for itself for ever, see `gru._orthogonal`."""
 
     def initial(key: Array) -> object:
-        return GRU(8).init(key, as_given(jnp.zeros((1, 1, 2))), jnp.zeros((1, 8)))
+        return GRU(8).init(key, jnp.zeros((1, 1, 2)), jnp.zeros((1, 8)))
 
     keys = jax.random.split(jax.random.key(0), 2)
     assert "lapack" not in jax.jit(jax.vmap(initial)).lower(keys).as_text()

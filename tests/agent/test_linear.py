@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from typing import Any
-
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
 
-from sqn_jax.agent.linear import (
-    Branches,
-    Linear,
-    affine,
-    apply_each,
-    stacked,
-    sum_rows,
-    then,
-)
+from sqn_jax.agent.linear import Dense, affine, sum_rows
 
 
 def arrays(*leading: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -67,101 +56,28 @@ def test_rows_are_summed() -> None:
     assert sum_rows(rows).tolist() == [0 + 3 + 6 + 9, 1 + 4 + 7 + 10, 2 + 5 + 8 + 11]
 
 
-SIZES = ((5, 4), (3, 6))
-"""D_i and E_i of two layers side by side."""
-AFTER = 7
-"""F of a layer that follows both."""
-FEW, MANY = 2, 400
+def test_the_layer_is_that_of_flax_for_the_same_parameters() -> None:
+    inputs = jnp.asarray(arrays(3, 2)[0], jnp.float32)
+    params = Dense(3).init(jax.random.key(0), inputs)
+    theirs = nn.Dense(3)
+    assert jax.tree.map(jnp.shape, params) == jax.tree.map(
+        jnp.shape, theirs.init(jax.random.key(0), inputs)
+    )
+    np.testing.assert_allclose(
+        Dense(3).apply(params, inputs), theirs.apply(params, inputs), atol=1e-6
+    )
 
 
-def random_layers(rng: np.random.Generator, sizes: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    return [(rng.normal(size=(given, made)), rng.normal(size=made)) for given, made in sizes]
-
-
-def as_linear(layers: Any) -> list[Linear]:
-    return [Linear(*(jnp.asarray(x, jnp.float32) for x in layer)) for layer in layers]
-
-
-def test_stacked_layers_do_what_each_does_with_the_same_inputs() -> None:
-    rng = np.random.default_rng(1)
-    layers = random_layers(rng, [(5, 4), (5, 1), (5, 3)])
-    inputs = rng.normal(size=(2, 5))
-    got = affine(jnp.asarray(inputs, jnp.float32), *stacked(as_linear(layers)))
-    expected = [inputs @ kernel + bias for kernel, bias in layers]
-    np.testing.assert_allclose(got, np.concatenate(expected, axis=1), atol=1e-5)
-
-
-def test_layers_with_inputs_of_their_own_see_nothing_of_each_other_s() -> None:
-    rng = np.random.default_rng(2)
-    layers = random_layers(rng, [(5, 4), (3, 1), (2, 6)])
-    inputs = [rng.normal(size=(2, given)) for given in (5, 3, 2)]
-    joined = jnp.asarray(np.concatenate(inputs, axis=1), jnp.float32)
-    got = apply_each(joined, as_linear(layers))
-    expected = [x @ kernel + bias for x, (kernel, bias) in zip(inputs, layers, strict=True)]
-    np.testing.assert_allclose(got, np.concatenate(expected, axis=1), atol=1e-5)
-
-
-def two_then_one(rows: int) -> tuple[list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
-    """Random inputs of two layers, and the kernels and biases of all three layers."""
-    rng = np.random.default_rng(rows)
-    inputs = [rng.normal(size=(2, rows // 2, given)) for given, _ in SIZES]
-    return inputs, random_layers(rng, [*SIZES, (4 + 6, AFTER)])
-
-
-def in_a_row(inputs: Sequence[Any], layers: list[Linear]) -> Array:
-    first, second, following = layers
-    joined = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in inputs], axis=-1)
-    return then(Branches(joined, (first, second)), following)
-
-
-def test_layers_in_a_row_are_one_after_the_other() -> None:
-    inputs, layers = two_then_one(MANY)
-    outputs = [x @ kernel + bias for x, (kernel, bias) in zip(inputs, layers, strict=False)]
-    kernel, bias = layers[2]
-    expected = np.concatenate(outputs, axis=-1) @ kernel + bias
-    got = in_a_row(inputs, as_linear(layers))
-    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_layers_in_a_row_have_the_derivatives_of_the_product_written_out() -> None:
-    inputs, layers = two_then_one(MANY)
-
-    def written_out(layers: list[Linear]) -> Array:
-        outputs = [
-            jnp.asarray(x, jnp.float32) @ kernel + bias[None, None]
-            for x, (kernel, bias) in zip(inputs, layers, strict=False)
-        ]
-        kernel, bias = layers[2]
-        return jnp.sin(jnp.concatenate(outputs, axis=-1) @ kernel + bias[None, None]).sum()
-
-    def ours(layers: list[Linear]) -> Array:
-        return jnp.sin(in_a_row(inputs, layers)).sum()
-
-    found = [jax.tree.leaves(jax.grad(f)(as_linear(layers))) for f in (ours, written_out)]
-    for got, expected in zip(*found, strict=True):
-        np.testing.assert_allclose(got, expected, rtol=2e-3, atol=2e-3)
-
-
-def test_many_rows_through_layers_in_a_row_take_the_multiplications_of_one_layer() -> None:
-    """By XLA's own count, which also has the few additions."""
-    inputs, layers = two_then_one(MANY)
-    compiled = jax.jit(lambda layers: in_a_row(inputs, layers)).lower(as_linear(layers)).compile()
-    one_layer = 2 * MANY * (5 + 3) * AFTER
-    both_kernels = 2 * (5 * 4 + 3 * 6) * AFTER
-    assert one_layer <= compiled.cost_analysis()["flops"] < 1.35 * (one_layer + both_kernels)
-
-
-def test_few_rows_in_a_loop_do_not_multiply_the_layers_again_and_again() -> None:
-    """What XLA's loop is given is the one layer, [8, 7], not the last of the two, [10, 7]."""
-    inputs, layers = two_then_one(FEW)
-
-    def turns(layers: list[Linear]) -> Array:
-        def turn(total: Array, _: None) -> tuple[Array, None]:
-            return in_a_row([x + total for x in inputs], layers).sum(), None
-
-        return jax.lax.scan(turn, jnp.float32(0), None, length=9)[0]
-
-    text = jax.jit(turns).lower(as_linear(layers)).compile().as_text()
-    (held,) = re.findall(r" = \((.*)\) while\(", text)
-    assert "f32[8,7]" in held
-    assert "f32[10,7]" not in held
+@pytest.mark.parametrize("scale", [1.0, 4.0, 0.1])
+def test_a_fresh_layer_has_weights_of_the_scale_and_biases_spread_over_its_range(
+    scale: float,
+) -> None:
+    """Weights of standard deviation scale / sqrt(D), biases even over +-scale / sqrt(D)."""
+    fan_in, size = 64, 2000
+    params = Dense(size, scale).init(jax.random.key(1), jnp.zeros((1, fan_in)))["params"]
+    kernel, bias = (np.asarray(params[name]) * fan_in**0.5 / scale for name in ("kernel", "bias"))
+    assert kernel.std() == pytest.approx(1, rel=0.02)
+    assert np.abs(kernel).max() < 2.3  # Cut off at two standard deviations of the uncut normal.
+    assert np.abs(bias).max() <= 1
+    counts, _ = np.histogram(bias, bins=4, range=(-1, 1))
+    assert counts.min() > 0.85 * size / 4

@@ -65,6 +65,79 @@ def test_outputs_are_those_of_the_equations(algo: str, num_skills: int, layer_no
     np.testing.assert_allclose(new_carry, expected.carry, atol=1e-5)
 
 
+def plain_mlp(block: Any, inputs: jax.Array) -> jax.Array:
+    hidden = inputs @ block["hidden"]["kernel"] + block["hidden"]["bias"]
+    if "norm" in block:
+        hidden = plain_norm(block["norm"], hidden)
+    return jnp.maximum(hidden, 0) @ block["output"]["kernel"] + block["output"]["bias"]
+
+
+def plain_norm(block: Any, hidden: jax.Array) -> jax.Array:
+    centered = hidden - hidden.mean(axis=-1, keepdims=True)
+    spread = jnp.sqrt((centered**2).mean(axis=-1, keepdims=True) + 1e-6)
+    return centered / spread * block["scale"] + block["bias"]
+
+
+def plain_gru(block: Any, features: jax.Array, carry: jax.Array) -> jax.Array:
+    states = []
+    for inputs in features @ block["input_kernel"] + block["input_bias"]:
+        from_inputs = jnp.split(inputs, 3, axis=-1)
+        from_hidden = jnp.split(carry @ block["hidden_kernel"], 3, axis=-1)
+        reset = jax.nn.sigmoid(from_inputs[0] + from_hidden[0])
+        update = jax.nn.sigmoid(from_inputs[1] + from_hidden[1])
+        inner = reset * (from_hidden[2] + block["candidate_bias"])
+        carry = (1 - update) * jnp.tanh(from_inputs[2] + inner) + update * carry
+        states.append(carry)
+    return jnp.stack(states)
+
+
+def plain_q_values(algo: str, params: Any, obs: Seen, carry: jax.Array) -> jax.Array:
+    """Q-values [T, B, A] in plain array operations, for automatic differentiation."""
+    tree = params["params"]
+    parts = [plain_mlp(tree["features"][name], getattr(obs, name)) for name in ("ranges", "goal")]
+    features = jnp.concatenate(parts, axis=-1)
+    if algo == "dqn":
+        hidden = features @ tree["perception"]["kernel"] + tree["perception"]["bias"]
+        hidden = plain_norm(tree["norm"], hidden) if "norm" in tree else hidden
+        return plain_mlp(tree["skill_0"], jnp.maximum(hidden, 0))
+    perception = plain_gru(tree["perception"], features, carry)
+    if algo == "r2d2":
+        return plain_mlp(tree["skill_0"], perception)
+    decision = jax.nn.softmax(plain_mlp(tree["decision"], perception + tree["decision_embedding"]))
+    skills = [
+        plain_mlp(tree[name], perception + tree[f"{name}_embedding"])
+        for name in ("skill_0", "skill_1")
+    ]
+    return decision[..., :1] * skills[0] + decision[..., 1:] * skills[1]
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("algo", ALGOS)
+def test_gradients_are_those_of_plain_array_operations(algo: str, layer_norm: bool) -> None:
+    rng = np.random.default_rng(15)
+    network = small_network(algo, layer_norm=layer_norm)
+    params, obs, carry = (
+        random_params(network, rng),
+        random_obs(rng, LENGTH, BATCH),
+        random_carry(rng),
+    )
+    weights = jnp.asarray(rng.normal(size=(LENGTH, BATCH, NUM_ACTIONS)), jnp.float32)
+
+    def ours(params: Any, carry: jax.Array) -> jax.Array:
+        return (weights * network.apply(params, obs, carry)[1].q_values).sum()
+
+    def plain(params: Any, carry: jax.Array) -> jax.Array:
+        return (weights * plain_q_values(algo, params, obs, carry)).sum()
+
+    found = jax.jit(jax.grad(ours, argnums=(0, 1)))(params, carry)
+    with jax.numpy_rank_promotion("allow"):
+        expected = jax.jit(jax.grad(plain, argnums=(0, 1)))(params, carry)
+    pairs = zip(jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(expected), strict=True)
+    for (path, got), wanted in pairs:
+        name = jax.tree_util.keystr(path)
+        np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=2e-5, err_msg=name)
+
+
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_one_skill_is_the_r2d2_network(layer_norm: bool) -> None:
     rng = np.random.default_rng(11)
@@ -170,6 +243,32 @@ def test_layers_are_128_wide_and_those_of_the_dqn_after_the_features_three_times
     assert dqn["features"] == paper_sized("r2d2")["params"]["features"] == sqn["features"]
     assert dqn["perception"]["kernel"].shape == (256, 384)
     assert dqn["skill_0"]["hidden"]["kernel"].shape == (384, 384)
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_layers_start_at_their_scales(algo: str) -> None:
+    """Times sqrt(D): 4 where the goal comes in, 0.1 where a decision or Q-values come out."""
+    network = make_network(algo, NetworkConfig(), 5)
+    obs = Seen(ranges=jnp.zeros((1, 1, 71)), goal=jnp.zeros((1, 1, 2)))
+    params = jax.jit(network.init)(jax.random.key(2), obs, jnp.zeros((1, 128)))["params"]
+    heads = ("decision", "skill_0", "skill_1") if algo == "sqn" else ("skill_0",)
+    expected = {("features", "goal", "hidden"): 4.0}
+    expected |= {("features", "goal", "output"): 1.0}
+    expected |= {("features", "ranges", layer): 1.0 for layer in ("hidden", "output")}
+    expected |= {(head, "hidden"): 1.0 for head in heads}
+    expected |= {(head, "output"): 0.1 for head in heads}
+    if algo == "dqn":
+        expected[("perception",)] = 1.0
+    for path, scale in expected.items():
+        layer = params
+        for name in path:
+            layer = layer[name]
+        fan_in = layer["kernel"].shape[0]
+        assert float(layer["kernel"].std()) == pytest.approx(scale / fan_in**0.5, rel=0.15), path
+        largest = float(np.abs(layer["bias"]).max())
+        assert 0.2 * scale < largest * fan_in**0.5 <= scale, path
+    for name in heads if algo == "sqn" else ():
+        assert float(params[f"{name}_embedding"].std()) == pytest.approx(0.02, rel=0.3)
 
 
 def test_a_fresh_network_prefers_no_skill_and_expects_nothing() -> None:

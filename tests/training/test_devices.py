@@ -199,35 +199,3 @@ def test_the_number_of_cores_is_left_as_the_user_has_set_it(
     monkeypatch.delenv("XLA_FLAGS")
     devices.use_cores()  # The tests themselves have set it to 2.
     assert told == []
-
-
-def test_whole_episodes_are_compiled_with_eigen_s_products_and_windows_as_usual() -> None:
-    """That the option does what it is for shows in the program: no fusion by YNNPACK is left."""
-    options = devices.compiler_options(config_for("r2d2"))
-    assert devices.compiler_options(config_for("pqn")) == {}
-    multiply = jax.jit(lambda x, y: jnp.maximum(x @ y, 0)).lower(*[jnp.ones((256, 256))] * 2)
-    jax.config.update("jax_disable_most_optimizations", False)
-    usual, ours = (multiply.compile(compiler_options=told).as_text() for told in ({}, options))
-    jax.config.update("jax_disable_most_optimizations", True)
-    assert "ynn_fusion" in usual
-    assert "ynn_fusion" not in ours
-
-
-def test_where_xla_does_not_know_the_option_its_default_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert devices._knows((("xla_cpu_enable_fast_math", False),))
-    assert not devices._knows((("xla_cpu_of_another_version", ""),))
-    monkeypatch.setattr(devices, "_knows", lambda options: False)
-    assert devices.compiler_options(config_for("r2d2")) == {}
-
-
-def test_what_the_user_has_told_xla_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    (name,) = devices.compiler_options(config_for("r2d2"))
-    monkeypatch.setenv("XLA_FLAGS", f"--xla_some=1 --{name}=LIBRARY_FUSION_TYPE_DOT")
-    assert devices.compiler_options(config_for("r2d2")) == {}
-
-
-def test_another_device_than_the_cpu_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert devices.compiler_options(config_for("r2d2")) == {}
