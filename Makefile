@@ -23,12 +23,15 @@ help:  ## list the targets
 train: $(INSTALLED)  ## train a robot, evaluate it and draw what it did; options in ARGS
 	@$(BIN)/sqn train $(ARGS)
 
-# A file's tests stay in one process: they share what they compile.
-test: $(INSTALLED)  ## run the tests, but for the long ones
-	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+# A file's tests stay in one process: they share what they compile. Files come in the order of
+# tests/conftest.py. A process that crashed is not begun anew: the run ends with its test's name.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
-test-long: $(INSTALLED)  ## run all tests
-	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "" $(ARGS)
+test: $(INSTALLED)  ## run the tests, but for the long ones
+	@$(PYTEST) $(ARGS)
+
+test-long: $(INSTALLED)  ## run all tests, their programs compiled as users' are
+	@SQN_TESTS_COMPILE=as-users $(PYTEST) -m "" $(ARGS)
 
 table: $(INSTALLED)  ## train three agents, compare them on four maps, write the paper's table
 	@$(BIN)/python experiments/table1.py $(ARGS)

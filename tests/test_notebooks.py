@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import io
 import json
@@ -72,7 +73,11 @@ def test_there_are_four_notebooks() -> None:
     assert [path.stem for path in sorted(FOLDER.glob("*.ipynb"))] == [s.stem for s in SOURCES]
 
 
-@BY_NAME
+@pytest.mark.parametrize(
+    "source",
+    [SOURCES[0], *(pytest.param(source, marks=pytest.mark.long) for source in SOURCES[1:])],
+    ids=lambda source: source.stem,
+)
 def test_a_notebook_runs_as_plain_python(
     source: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,6 +86,19 @@ def test_a_notebook_runs_as_plain_python(
     monkeypatch.setattr(style, "DPI", 40)
     runpy.run_path(str(source), run_name="__main__")
     assert len(capsys.readouterr().out.splitlines()) > 10
+
+
+@BY_NAME
+def test_a_notebook_finds_what_it_imports(source: Path) -> None:
+    """The short form of running them all: a name that has moved."""
+    imports = [
+        node
+        for node in ast.parse(source.read_text("utf-8")).body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
+    assert len(imports) > 3
+    for each in imports:
+        exec(ast.unparse(each), {})
 
 
 @BY_NAME
