@@ -53,7 +53,8 @@ def paper_table(results: list[dict[str, Any]]) -> str:
 
 
 def _spread(told: dict[str, Any], digits: int) -> str:
-    return f"{told['mean']:.{digits}f} ± {told['std_of_means']:.{digits}f}"
+    mean, spread = told["mean"], told["std_of_means"]
+    return f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
 
 
 def report(evaluation: dict[str, Any], settings: Settings) -> str:
@@ -65,8 +66,8 @@ def report(evaluation: dict[str, Any], settings: Settings) -> str:
         "",
         f"Greedy episodes between the maps' evaluation points, {settings.episodes} under each of "
         f"{settings.eval_seeds} evaluation seeds, {seeds} training seed(s); goal radius "
-        f"{settings.goal_radii[0]:g} m, failures at the step limit. ± is the spread of the means "
-        "of the seeds.",
+        f"{settings.goal_radii[0]:g} m, failures at the step limit. ± is the sample standard "
+        "deviation (n - 1) of the means of the pairs of training seed and evaluation seed.",
         "",
         paper_table(results),
         "",

@@ -33,6 +33,9 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
 }
 """The two kinds of tasks, and the spawn mode that draws them."""
 
+SCHEMA = 2
+"""Of the evaluation file."""
+
 MOST_EPISODES, MOST_STEPS = 100_000, 100_000
 """Under one evaluation seed, and an episode: more would not fit into memory."""
 
@@ -277,7 +280,8 @@ def evaluate_agents(
             those who want the traces.
 
     Returns:
-        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode.
+        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode. Schema
+        1 had population standard deviations, 2 has those of the sample (`scores.describe`).
     """
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
@@ -307,7 +311,7 @@ def evaluate_agents(
         for second in quiet
         if first != second and (told := scores.improvement(quiet[first], quiet[second]))
     ]
-    return {"schema": 1, "results": results, "comparisons": comparisons}, records
+    return {"schema": SCHEMA, "results": results, "comparisons": comparisons}, records
 
 
 def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:

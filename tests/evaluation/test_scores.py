@@ -63,7 +63,7 @@ def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> No
     told = describe(ours, oracle)["steps_over_oracle"]
     expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
     assert told["mean"] == pytest.approx(np.mean(expected))
-    assert told["std"] == pytest.approx(np.std(expected))
+    assert told["std"] == pytest.approx(np.std(expected, ddof=1))
     assert describe(ours)["steps_over_oracle"] is None
     nowhere = outcome(0, 1000, [False] * 4)
     assert describe([nowhere], oracle)["steps_over_oracle"] is None
@@ -74,8 +74,18 @@ def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> No
         [outcome(0, 1000, [True, True, True, True]), outcome(0, 1001, [True, False, False, True])]
     )
     assert told["success"]["mean"] == 0.75
-    assert told["success"]["std_of_means"] == 0.25
-    assert told["success"]["std"] == pytest.approx(np.sqrt(0.75 * 0.25))
+    # Means 1 and 0.5; six successes in eight episodes. Divided by n - 1.
+    assert told["success"]["std_of_means"] == pytest.approx(np.sqrt(2 * 0.25**2 / 1))
+    assert told["success"]["std"] == pytest.approx(np.sqrt(8 * 0.75 * 0.25 / 7))
+
+
+def test_a_single_seed_has_no_spread() -> None:
+    told = describe([outcome(0, 1000, [True, False])])
+    assert told["success"]["std_of_means"] is None
+    assert told["success"]["std"] == pytest.approx(np.sqrt(0.5))
+    alone = describe([outcome(0, 1000, [True])])
+    assert alone["time_steps"]["std"] is None
+    assert alone["time_steps_success"]["std"] is None
 
 
 def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
@@ -139,7 +149,7 @@ def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> Non
                 {
                     **{"map": "maze", "agent": "sqn", "tasks": "evaluation points"},
                     **{"velocity_noise": noise, "range_noise": 0.0, "goal_radius": radius},
-                    **describe([outcome(0, 1000, success)]),
+                    **describe([outcome(0, seed, success) for seed in (1000, 1001)]),
                 }
             )
     header, _, quiet, noisy = results_table(entries).splitlines()
@@ -153,3 +163,5 @@ def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> Non
         "1.00",
     ]
     assert "velocity 0.2" in noisy
+    alone = entries[0] | describe([outcome(0, 1000, [True, False])])
+    assert results_table([alone]).splitlines()[2].split("|")[4].strip() == "0.50"
