@@ -6,7 +6,8 @@ versions, the flags and the instruction set of the processor: a home shared by d
 is no danger.
 
 What is read is executed. The folder is therefore private, and one that others can write to is not
-used. Whoever imports the library gets no cache: only `session` asks for one.
+used. Whoever imports the library gets no cache: only what trains, evaluates, renders or writes a
+report asks for one.
 """
 
 from __future__ import annotations
