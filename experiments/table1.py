@@ -3,8 +3,8 @@
     .venv/bin/python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
 
 Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
-table1.jsonl), table1.md and learning_curves.png. With smoke the robots learn next to nothing; it shows
-that everything works.
+table1.jsonl), table1.md and learning_curves.png. With smoke the robots learn next to nothing; it
+shows that everything works.
 """
 
 from __future__ import annotations
