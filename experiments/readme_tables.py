@@ -1,86 +1,97 @@
-"""Write the README's tables from the recorded files: python experiments/readme_tables.py [--check]
+"""Write the tables of the pages from the records: python experiments/readme_tables.py [--check]
 
-Each table stands between `<!-- table NAME -->` and `<!-- end -->`; what is between is replaced.
-With `--check` nothing is written: the exit code is 1 if a table is not what the records say.
+Each table stands between `<!-- table NAME -->` and `<!-- end -->` in README.md, docs/RESULTS.md or
+docs/LAB_NOTES.md; what is between is replaced. With `--check` nothing is written: the exit code is
+1 if a table is not what the records say.
+
+± is the sample standard deviation (n - 1). Records without `std_ddof` hold the population figure,
+of which `spread` makes that of the sample.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from experiments.common import recorded, run
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.statistics import sample_std
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("README.md", "docs/RESULTS.md", "docs/LAB_NOTES.md")
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
-PRETRAINED = {
-    "sqn best": "`pretrained:best`",
-    "sqn sqn": "`pretrained:sqn`",
-    "r2d2": "`pretrained:r2d2`",
-    "dqn": "`pretrained:dqn`",
-}
-"""Names of agents in evaluations of all policies that come with the package."""
+ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
+"""Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
 RADIUS = 0.3
 
 Entry = dict[str, Any]
 
 
+def agents() -> str:
+    """Three agents trained alike on the Maze, each above the paper's: success and time steps."""
+    entries = _results("pretrained_table.json")
+    rows = []
+    for agent, algorithm in ALIKE.items():
+        ours = [_one(entries, agent, name) for name in PAPER_MAPS]
+        rows.append([NAMES[algorithm], *(f"{_mean(each)}, {_steps(each)}" for each in ours)])
+        rows.append(_paper_row(algorithm))
+    return markdown_table(["success, time steps", *PAPER_MAPS], rows)
+
+
 def policies() -> str:
-    """The policies that come with the package on the paper's four maps, beside the paper's."""
-    entries = recorded("pretrained_table.json")["results"]
+    """The policies that come with the package, and the baselines: success and time steps."""
+    entries = _results("pretrained_table.json")
+    labels = {
+        **{agent: f"`pretrained:{algorithm}`" for agent, algorithm in ALIKE.items()},
+        **{"sqn best": "`pretrained:best`", "bug": "bug", "oracle": "oracle"},
+    }
     rows = [
-        [label, *(_success_and_steps(_one(entries, agent, name)) for name in PAPER_MAPS)]
-        for agent, label in (PRETRAINED | {"bug": "bug", "oracle": "oracle"}).items()
+        [label, *(_in_full(_one(entries, agent, name)) for name in PAPER_MAPS)]
+        for agent, label in labels.items()
     ]
-    for algorithm in NAMES:
-        found = [PAPER_RESULTS[algorithm][name] for name in PAPER_MAPS]
-        cells = [f"{success:.2f}, {steps:.0f}" for success, steps in found]
-        rows.append([f"paper, {NAMES[algorithm]}", *cells])
+    rows += [_paper_row(algorithm) for algorithm in NAMES]
     return markdown_table(["", *PAPER_MAPS], rows)
 
 
 def seeds() -> str:
-    """All training seeds of the preset `quick`: mean success and its spread over them."""
-    found = recorded("seeds_table.json")
-    agents = list(dict.fromkeys(entry["agent"] for entry in found["results"]))
-    maps = list(dict.fromkeys(entry["map"] for entry in found["results"]))
+    """Several training seeds of the preset `quick`: mean success and its spread over them."""
+    evaluation = recorded("seeds_table.json")
+    return f"{_over_seeds(evaluation)}\n\n{_comparisons(evaluation)}"
+
+
+def paper() -> str:
+    """Five training seeds of the preset `paper`."""
+    evaluation = recorded("paper_table.json")
+    return f"{_over_seeds(evaluation)}\n\n{_comparisons(evaluation)}"
+
+
+def dead_ends() -> str:
+    """Agents trained on the Maze and twelve caves: success of each training seed."""
+    entries = _results("caves_horizon_table.json")
     rows = []
-    for agent in agents:
-        scores = [_one(found["results"], agent, name)["success_per_seed"] for name in maps]
-        count = f"{len(scores[0])} seed" + "s" * (len(scores[0]) > 1)
-        cells = [f"{np.mean(each):.2f} ± {np.std(each):.2f}" for each in scores]
-        rows.append([f"{NAMES[agent]}, {count}", *cells])
-    lines = [markdown_table(["", *maps], rows), ""]
-    for told in found["comparisons"]:
-        first, second = told["first"], told["second"]
-        if agents.index(first) < agents.index(second):
-            low, high = told["ci95"]
-            lines.append(
-                f"{NAMES[first]} beats {NAMES[second]} with probability "
-                f"{told['probability']:.2f} [{low:.2f}, {high:.2f}]."
-            )
-    return "\n".join(lines)
+    for agent, label in NAMES.items():
+        scores = [_one(entries, agent, name)["success_per_seed"] for name in ("maze", "cave")]
+        rows.append([label, *(", ".join(f"{score:.3f}" for score in each) for each in scores)])
+    return markdown_table(["", "maze", "cave"], rows)
 
 
 def noise() -> str:
     """Success on the maze under the paper's noise."""
-    three = recorded("pretrained_noise.json")["results"]
-    best = recorded("best_noise.json")["results"]
+    three = _results("pretrained_noise.json")
+    best = _results("best_noise.json")
     header = ["", "none", *(f"velocity {level:g}" for level in VELOCITY_NOISE)]
     header += [f"range {100 * level:.0f} %" for level in RANGE_NOISE]
     rows = [
         [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in LEVELS)]
         for label, entries, agent in (
-            ("`pretrained:best`", best, "sqn"),
             *((f"`pretrained:{agent}`", three, agent) for agent in NAMES),
+            ("`pretrained:best`", best, "sqn"),
         )
     ]
     return markdown_table(header, rows)
@@ -88,7 +99,7 @@ def noise() -> str:
 
 def quick() -> str:
     """The run of `make train`, evaluated with more episodes."""
-    entries = recorded("maze_quick_500.json")["results"]
+    entries = _results("maze_quick_500.json")
     labels = {
         "random pairs": "random pairs of spawn points",
         "evaluation points": "the four evaluation points",
@@ -96,15 +107,60 @@ def quick() -> str:
     rows = []
     for tasks, label in labels.items():
         entry = _one(entries, "sqn", "maze", tasks=tasks)
-        steps, spl = entry["time_steps"]["mean"], entry["spl"]["mean"]
-        rows.append([label, _mean(entry), f"{steps:.0f}", f"{spl:.2f}"])
-    success, steps = PAPER_RESULTS["sqn"]["maze"]
-    rows.append(["the paper, SQN, on its own maze", f"{success:.2f}", f"{steps:.0f}", ""])
-    header = ["Greedy episodes on the maze", "success", "time steps, failures at 400", "SPL"]
-    return markdown_table(header, rows)
+        spl = f"{entry['spl']['mean']:.2f} ± {spread(entry, 'spl'):.2f}"
+        rows.append([label, _mean_and_spread(entry), _steps(entry), spl])
+    return markdown_table(["500 greedy episodes on the maze", "success", "steps", "SPL"], rows)
 
 
-TABLES = {each.__name__: each for each in (policies, seeds, noise, quick)}
+TABLES = {each.__name__: each for each in (agents, policies, quick, seeds, paper, dead_ends, noise)}
+
+
+def spread(entry: Entry, metric: str = "success") -> float:
+    """Sample standard deviation of the means of the (training seed, evaluation seed) pairs.
+
+    Evaluation files without `std_ddof` hold the standard deviation of the population.
+    """
+    deviation: float = entry[metric]["std_of_means"]
+    count = len(entry["training_seeds"]) * len(entry["eval_seeds"])
+    return deviation if entry["std_ddof"] else deviation * float((count / (count - 1)) ** 0.5)
+
+
+def _results(name: str) -> list[Entry]:
+    """The results of an evaluation on record, each with the `std_ddof` of its file."""
+    evaluation = recorded(name)
+    return [{**entry, "std_ddof": evaluation.get("std_ddof", 0)} for entry in evaluation["results"]]
+
+
+def _over_seeds(evaluation: dict[str, Any]) -> str:
+    """Mean success of the training seeds on each map, and its spread over them."""
+    entries = evaluation["results"]
+    maps = list(dict.fromkeys(entry["map"] for entry in entries))
+    rows = []
+    for agent in dict.fromkeys(entry["agent"] for entry in entries):
+        scores = [_one(entries, agent, name)["success_per_seed"] for name in maps]
+        count = f"{len(scores[0])} seed" + "s" * (len(scores[0]) > 1)
+        rows.append([f"{NAMES[agent]}, {count}", *(_over(each) for each in scores)])
+    return markdown_table(["", *maps], rows)
+
+
+def _over(scores: Sequence[float]) -> str:
+    deviation = sample_std(scores)
+    mean = f"{sum(scores) / len(scores):.2f}"
+    return mean if deviation is None else f"{mean} ± {deviation:.2f}"
+
+
+def _comparisons(evaluation: dict[str, Any]) -> str:
+    agents = list(dict.fromkeys(entry["agent"] for entry in evaluation["results"]))
+    lines = []
+    for comparison in evaluation["comparisons"]:
+        first, second = comparison["first"], comparison["second"]
+        if agents.index(first) < agents.index(second):
+            low, high = comparison["ci95"]
+            lines.append(
+                f"{NAMES[first]} beats {NAMES[second]} with probability "
+                f"{comparison['probability']:.2f} [{low:.2f}, {high:.2f}]."
+            )
+    return "\n".join(lines)
 
 
 def _one(
@@ -124,10 +180,25 @@ def _mean(entry: Entry) -> str:
     return f"{entry['success']['mean']:.2f}"
 
 
-def _success_and_steps(entry: Entry) -> str:
-    told = f"{_mean(entry)}, {entry['time_steps']['mean']:.0f}"
+def _mean_and_spread(entry: Entry) -> str:
+    return f"{_mean(entry)} ± {spread(entry):.2f}"
+
+
+def _steps(entry: Entry) -> str:
+    return f"{entry['time_steps']['mean']:.0f}"
+
+
+def _in_full(entry: Entry) -> str:
+    """Success, time steps, and in brackets the steps of the successes over the oracle's."""
+    text = f"{_mean_and_spread(entry)}, {_steps(entry)}"
     ratio = entry["steps_over_oracle"]
-    return told if ratio is None or entry["agent"] == "oracle" else f"{told} ({ratio['mean']:.2f})"
+    return text if ratio is None or entry["agent"] == "oracle" else f"{text} ({ratio['mean']:.2f})"
+
+
+def _paper_row(algorithm: str) -> list[str]:
+    results = [PAPER_RESULTS[algorithm][name] for name in PAPER_MAPS]
+    cells = [f"{success:.2f}, {steps:.0f}" for success, steps in results]
+    return [f"{NAMES[algorithm]} in the paper", *cells]
 
 
 def filled(text: str) -> str:
@@ -151,18 +222,23 @@ def filled(text: str) -> str:
 
 
 def main() -> None:
-    """Fill in the README."""
+    """Fill in the pages."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args()
-    page = ROOT / "README.md"
-    before = page.read_text(encoding="utf-8")
-    after = filled(before)
+    differing = []
+    for name in PAGES:
+        page = ROOT / name
+        before = page.read_text(encoding="utf-8")
+        after = filled(before)
+        if after != before:
+            differing.append(name)
+            if not options.check:
+                page.write_text(after, encoding="utf-8")
     if options.check:
-        print("README.md says what the records say" if after == before else "README.md differs")
-        raise SystemExit(after != before)
-    page.write_text(after, encoding="utf-8")
-    print(f"filled {len(re.findall(r'<!-- table', after))} tables of README.md")
+        print(f"differ: {', '.join(differing)}" if differing else "every table is as on record")
+        raise SystemExit(bool(differing))
+    print(f"written: {', '.join(differing)}" if differing else "every table was as on record")
 
 
 if __name__ == "__main__":

@@ -3,9 +3,8 @@
     .venv/bin/python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
 
 Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
-table1.jsonl), table1.md and learning_curves.png. On two cores: seven minutes and more a quick run,
-an hour or so a paper run, five minutes or so in all for smoke, whose robots learn next to nothing:
-it shows that everything works.
+table1.jsonl), table1.md and learning_curves.png. With smoke the robots learn next to nothing; it
+shows that everything works.
 """
 
 from __future__ import annotations
@@ -53,7 +52,8 @@ def paper_table(results: list[dict[str, Any]]) -> str:
 
 
 def _spread(told: dict[str, Any], digits: int) -> str:
-    return f"{told['mean']:.{digits}f} ± {told['std_of_means']:.{digits}f}"
+    mean, spread = told["mean"], told["std_of_means"]
+    return f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
 
 
 def report(evaluation: dict[str, Any], settings: Settings) -> str:
@@ -65,8 +65,8 @@ def report(evaluation: dict[str, Any], settings: Settings) -> str:
         "",
         f"Greedy episodes between the maps' evaluation points, {settings.episodes} under each of "
         f"{settings.eval_seeds} evaluation seeds, {seeds} training seed(s); goal radius "
-        f"{settings.goal_radii[0]:g} m, failures at the step limit. ± is the spread of the means "
-        "of the seeds.",
+        f"{settings.goal_radii[0]:g} m, failures at the step limit. ± is the sample standard "
+        "deviation (n - 1) of the means of the pairs of training seed and evaluation seed.",
         "",
         paper_table(results),
         "",

@@ -1,4 +1,4 @@
-"""Epsilon-greedy action selection with the paper's linear schedule (section IV-D)."""
+"""Epsilon-greedy action selection with the paper's linear schedule (section IV-C)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The three networks of the paper behind one interface: SQN, R2D2 and DQN (section III-B, IV-E).
+"""The three networks of the paper behind one interface: SQN, R2D2, DQN (sections III-B, IV-D).
 
 Each maps a time-major sequence of observations and a recurrent state to Q-values. The learner and
 the rollout know only this interface; which network runs is a matter of configuration.
@@ -120,7 +120,7 @@ class SkillQNetwork(nn.Module):
 
 
 class RecurrentQNetwork(nn.Module):
-    """The R2D2 baseline: the same perception, a single Q-head (section IV-E)."""
+    """The R2D2 baseline: the same perception, a single Q-head (section IV-D)."""
 
     config: NetworkConfig
     num_actions: int
@@ -136,7 +136,7 @@ class RecurrentQNetwork(nn.Module):
 
 
 class FeedForwardQNetwork(nn.Module):
-    """The DQN baseline: no memory, the layers after the features three times as wide (IV-E)."""
+    """The DQN baseline: no memory, the layers after the features three times as wide (IV-D)."""
 
     config: NetworkConfig
     num_actions: int

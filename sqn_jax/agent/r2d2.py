@@ -1,6 +1,6 @@
 """The method of the paper: R2D2, replay of whole episodes with priorities and a target network.
 
-Follows Kapturowski et al. 2019 with the paper's changes (section IV-D): sequences are whole
+Follows Kapturowski et al. 2019 with the paper's changes (section IV-C): sequences are whole
 episodes and the target network follows by Polyak averaging. Since an episode is stored from its
 first step on, the recurrent state starts at zero as it did on the robot.
 """

@@ -118,7 +118,7 @@ class RandomizationConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the networks (paper section III-B and IV-D)."""
+    """Sizes of the networks (paper sections III-B and IV-C)."""
 
     hidden_size: int = 128
     """Width of every layer and of the GRU."""
@@ -127,7 +127,7 @@ class NetworkConfig:
     layer_norm: bool = False
     """Layer normalisation before each ReLU; recurrent PQN needs it, the paper has none."""
     dqn_width_factor: int = 3
-    """How much wider the DQN's layers after the features are (paper section IV-E)."""
+    """How much wider the DQN's layers after the features are (paper section IV-D)."""
 
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):
@@ -226,7 +226,7 @@ class LearnerConfig:
 
 @dataclass(frozen=True)
 class ExplorationConfig:
-    """Epsilon-greedy exploration, falling linearly (paper section IV-D)."""
+    """Epsilon-greedy exploration, falling linearly (paper section IV-C)."""
 
     epsilon_start: float = 0.4
     """Probability of a random action at the start."""

@@ -90,5 +90,11 @@ PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(),
     "smoke": _smoke(),
 }
-"""`quick` is the default, `best` trains on all kinds of maps, `paper` follows the
-paper to the letter, `smoke` is for tests."""
+"""`quick` is the default, `best` trains on all kinds of maps, `smoke` is for tests.
+
+`paper` has every setting that the paper gives (sections III, IV-A, IV-C and IV-D). What it leaves
+open is chosen here: learning rate, Adam's epsilon and the gradient norm, discount, `n_step`, double
+Q-learning, value rescaling, priorities, size of the replay and when updates begin, robots a round
+and updates an episode, the robot's and the goal's radius. docs/ARCHITECTURE.md says why. On a GPU
+the products of the GRU are float16; ranges in the replay are 8 bits.
+"""

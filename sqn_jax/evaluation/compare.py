@@ -99,7 +99,9 @@ def evaluate_agents(
         fields: of `Trajectory`, what of all steps `on_evaluated` is to get beside poses and goals.
 
     Returns:
-        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode.
+        The evaluation file (`schema`, `std_ddof`, `results`, `comparisons`), and one record an
+        episode. `std_ddof` is 1: standard deviations are those of the sample (`scores.describe`).
+        Files without it hold the population's.
     """
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
@@ -133,7 +135,7 @@ def evaluate_agents(
         if first != second
         and (improvement := scores.improvement(quiet[first], quiet[second], main_radius))
     ]
-    return {"schema": 1, "results": results, "comparisons": comparisons}, records
+    return {"schema": 1, "std_ddof": 1, "results": results, "comparisons": comparisons}, records
 
 
 def _batches(

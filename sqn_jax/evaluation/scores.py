@@ -16,6 +16,7 @@ from sqn_jax.evaluation.statistics import (
     bootstrap_interval,
     interquartile_mean,
     probability_of_improvement,
+    sample_std,
     stratified_bootstrap,
     wilson_interval,
 )
@@ -38,8 +39,9 @@ def describe(
         success), `steps_over_oracle` (of each success over the oracle's in the same task; None
         without), `spl` (None where no shortest ways are known), `mean_reward`, `collisions`,
         `coverage_m2`: each with the `mean`, the `std` over episodes, a 95 % interval `ci95` over
-        episodes (Wilson for `success`, bootstrap for the others) and `std_of_means`, the spread of
-        the means of the (training seed, evaluation seed) pairs, which is what the paper gives.
+        episodes (Wilson for `success`, bootstrap for the others) and `std_of_means`, that of the
+        means of the (training seed, evaluation seed) pairs: for one training seed what the paper
+        gives. Both are sample standard deviations (n - 1), None for a single value.
         With several training seeds also `iqm` and `iqm_ci95`, the interquartile mean over them;
         the intervals over episodes say nothing of how much training seeds differ.
     """
@@ -83,7 +85,7 @@ def _describe(
     assert told is not None
     if name == "success":
         told["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
-    told["std_of_means"] = float(np.std([value.mean() for value in values]))
+    told["std_of_means"] = sample_std([value.mean() for value in values])
     scores = _of_each_seed(name, batches, goal_radius)
     if len(scores) > 1:
         told["iqm"] = interquartile_mean(scores)
@@ -104,7 +106,7 @@ def _over_episodes(values: NDArray[np.float64]) -> dict[str, Any] | None:
         return None
     return {
         "mean": float(values.mean()),
-        "std": float(values.std()),
+        "std": sample_std(values),
         "ci95": list(bootstrap_interval(values)),
     }
 
@@ -185,7 +187,8 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
     for entry in (entry for entry in results if entry["goal_radius"] == radii[0]):
         same = [other for other in results if _world_of(other) == _world_of(entry)]
         successes = [f"{other['success']['mean']:.2f}" for other in same]
-        successes[0] += f" ± {entry['success']['std_of_means']:.2f}"
+        if (spread := entry["success"]["std_of_means"]) is not None:
+            successes[0] += f" ± {spread:.2f}"
         tasks = "" if entry["tasks"] == "evaluation points" else f" ({entry['tasks']})"
         cells = [entry["map"] + tasks, entry["agent"], _noise_of(entry), *successes]
         shown = (("time_steps", 1), ("time_steps_success", 1), ("steps_over_oracle", 2), ("spl", 2))

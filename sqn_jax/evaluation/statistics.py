@@ -43,6 +43,12 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
+def sample_std(values: ArrayLike) -> float | None:
+    """Sample standard deviation (n - 1 in the denominator); None for fewer than two values."""
+    array = np.asarray(values, np.float64)
+    return float(array.std(ddof=1)) if array.size > 1 else None
+
+
 def interquartile_mean(scores: ArrayLike) -> float:
     """Mean of the middle half of all scores, runs and tasks together (Agarwal et al. 2021).
 

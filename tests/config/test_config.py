@@ -326,7 +326,7 @@ def test_a_config_cannot_be_changed_in_place() -> None:
 
 def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     paper = PRESETS["paper"]
-    # Section IV-D.
+    # Section IV-C.
     assert (paper.algo, paper.method, paper.map) == ("sqn", "r2d2", "maze")
     assert paper.learner.batch_size == 64
     assert paper.network.hidden_size == 128
@@ -338,7 +338,7 @@ def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     assert not paper.exploration.ladder
     assert paper.learner.burn_in_length == 10
     assert paper.total_episodes == 10_000
-    # The layers after the features of DQN are three times as wide (IV-E); no layer norm anywhere.
+    # The layers after the features of DQN are three times as wide (IV-D); no layer norm anywhere.
     assert paper.network.dqn_width_factor == 3
     assert not paper.network.layer_norm
     # The robot and its senses: 71 beams 5 degrees apart over 350 degrees, 5 m (III-A, IV-A).

@@ -59,7 +59,7 @@ def evaluated(run_dir: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]
     assert main([*words, "--out", str(run_dir.parent / "found.json")]) == 0
     found = json.loads((run_dir.parent / "found.json").read_text())
     lines = (run_dir.parent / "found.jsonl").read_text().splitlines()
-    assert found["schema"] == 1
+    assert (found["schema"], found["std_ddof"]) == (1, 1)
     return found["results"], [json.loads(line) for line in lines]
 
 

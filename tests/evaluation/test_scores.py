@@ -73,7 +73,7 @@ def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> No
     told = describe(ours, RADIUS, oracle)["steps_over_oracle"]
     expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
     assert told["mean"] == pytest.approx(np.mean(expected))
-    assert told["std"] == pytest.approx(np.std(expected))
+    assert told["std"] == pytest.approx(np.std(expected, ddof=1))
     assert describe(ours, RADIUS)["steps_over_oracle"] is None
     nowhere = batch(0, 1000, [False] * 4)
     assert describe([nowhere], RADIUS, oracle)["steps_over_oracle"] is None
@@ -85,8 +85,18 @@ def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> No
         RADIUS,
     )
     assert told["success"]["mean"] == 0.75
-    assert told["success"]["std_of_means"] == 0.25
-    assert told["success"]["std"] == pytest.approx(np.sqrt(0.75 * 0.25))
+    # Means 1 and 0.5; six successes in eight episodes. Divided by n - 1.
+    assert told["success"]["std_of_means"] == pytest.approx(np.sqrt(2 * 0.25**2 / 1))
+    assert told["success"]["std"] == pytest.approx(np.sqrt(8 * 0.75 * 0.25 / 7))
+
+
+def test_a_single_seed_has_no_spread() -> None:
+    told = describe([batch(0, 1000, [True, False])], RADIUS)
+    assert told["success"]["std_of_means"] is None
+    assert told["success"]["std"] == pytest.approx(np.sqrt(0.5))
+    alone = describe([batch(0, 1000, [True])], RADIUS)
+    assert alone["time_steps"]["std"] is None
+    assert alone["time_steps_success"]["std"] is None
 
 
 def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
@@ -150,7 +160,7 @@ def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> Non
                 {
                     **{"map": "maze", "agent": "sqn", "tasks": "evaluation points"},
                     **{"velocity_noise": noise, "range_noise": 0.0, "goal_radius": radius},
-                    **describe([batch(0, 1000, success)], RADIUS),
+                    **describe([batch(0, seed, success) for seed in (1000, 1001)], RADIUS),
                 }
             )
     header, _, quiet, noisy = results_table(entries).splitlines()
@@ -164,3 +174,5 @@ def test_the_table_has_one_row_an_agent_and_world_and_a_column_a_radius() -> Non
         "1.00",
     ]
     assert "velocity 0.2" in noisy
+    alone = entries[0] | describe([batch(0, 1000, [True, False])], RADIUS)
+    assert results_table([alone]).splitlines()[2].split("|")[4].strip() == "0.50"

@@ -12,6 +12,7 @@ from sqn_jax.evaluation.statistics import (
     bootstrap_interval,
     interquartile_mean,
     probability_of_improvement,
+    sample_std,
     stratified_bootstrap,
     success_weighted_path_length,
     wilson_interval,
@@ -28,6 +29,13 @@ def test_the_wilson_interval_solves_its_quadratic(successes: int, trials: int) -
     low, high = wilson_interval(successes, trials)
     assert low == pytest.approx(centre - half, abs=1e-9)
     assert high == pytest.approx(centre + half, abs=1e-9)
+
+
+def test_the_standard_deviation_is_that_of_a_sample() -> None:
+    """1, 2 and 6: mean 3, squares 4 + 1 + 9, divided by two."""
+    assert sample_std([1, 2, 6]) == pytest.approx(math.sqrt(14 / 2))
+    assert sample_std([3.0]) is None
+    assert sample_std([]) is None
 
 
 def test_the_bootstrap_interval_is_near_that_of_scipy() -> None:

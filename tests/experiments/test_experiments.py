@@ -38,6 +38,8 @@ def test_the_table_sets_our_numbers_beside_the_paper_s() -> None:
     assert "0.50 ± 0.03, 250.0 ± 4.0 (paper 0.98, 181.1)" in sqn
     assert "(paper 0.82, 767.5)" in sqn
     assert "paper" not in oracle
+    once = entry("sqn", "maze", 0.3) | {"success": {**TOLD, "std_of_means": None}}
+    assert "| 0.50, 250.0 ± 4.0 (paper" in table1.paper_table([once])
     page = table1.report({"results": results, "comparisons": []}, Settings(maps=("maze", "cave")))
     assert "goal radius 0.3 m" in page
     assert "success 0.5 m" in page

@@ -1,4 +1,4 @@
-"""The README's tables: they say what the recorded files say, and nothing else is touched."""
+"""The tables of README and docs: they say what the records say, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 
 from experiments import common, readme_tables
-from experiments.readme_tables import TABLES, filled
-
-README = Path(__file__).resolve().parents[2] / "README.md"
+from experiments.readme_tables import PAGES, ROOT, TABLES, filled, spread
 
 
 def entry(agent: str, name: str, scores: list[float], **changes: Any) -> dict[str, Any]:
@@ -19,8 +17,13 @@ def entry(agent: str, name: str, scores: list[float], **changes: Any) -> dict[st
     return {
         **{"agent": agent, "map": name, "tasks": "evaluation points", "goal_radius": 0.3},
         **{"velocity_noise": 0.0, "range_noise": 0.0, "training_seeds": list(range(len(scores)))},
-        **{"success": {"mean": mean}, "time_steps": {"mean": 123.4}, "success_per_seed": scores},
-        **{"steps_over_oracle": {"mean": 1.234}, "spl": {"mean": 0.5}, **changes},
+        **{
+            "success": {"mean": mean, "std_of_means": 0.1},
+            "time_steps": {"mean": 123.4},
+            "success_per_seed": scores,
+        },
+        **{"eval_seeds": [1000, 1001], "steps_over_oracle": {"mean": 1.234}},
+        **{"spl": {"mean": 0.5}, **changes},
     }
 
 
@@ -29,15 +32,24 @@ def write(folder: Path, name: str, results: list[Any], comparisons: list[Any]) -
     (folder / name).write_text(json.dumps(told), encoding="utf-8")
 
 
-def test_the_readme_says_what_the_records_say() -> None:
-    text = README.read_text(encoding="utf-8")
-    assert filled(text) == text
-    for name in TABLES:
-        assert f"<!-- table {name} -->" in text
+def cells_of(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+
+
+def test_the_pages_say_what_the_records_say() -> None:
+    begun = []
+    for name in PAGES:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert filled(text) == text, f"{name}: run experiments/readme_tables.py"
+        begun += [table for table in TABLES if f"<!-- table {table} -->" in text]
+    assert set(begun) == set(TABLES)
 
 
 def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """0.8 and 1.0 are 0.9 on average, 0.1 apart from it; other radii and noise are not mixed in."""
+    """0.8 and 1.0: mean 0.9, deviations of 0.1, so sqrt(0.02 / (2 - 1)) = 0.14.
+
+    Other radii and noise are not mixed in.
+    """
     maps = ("maze", "column", "forest", "cave")
     results = [entry("sqn", name, [0.8, 1.0]) for name in maps]
     results += [entry("r2d2", name, [0.5]) for name in maps]
@@ -48,12 +60,18 @@ def test_seeds_are_counted_and_spread(tmp_path: Path, monkeypatch: pytest.Monkey
     write(tmp_path, "seeds_table.json", results, [told, back])
     monkeypatch.setattr(common, "RESULTS", tmp_path)
     lines = readme_tables.seeds().splitlines()
-    assert [cell.strip() for cell in lines[2].split("|")[1:-1]] == [
-        "SQN, 2 seeds",
-        *["0.90 ± 0.10"] * 4,
-    ]
-    assert lines[3].startswith("| R2D2, 1 seed ")
+    assert cells_of(lines[2]) == [["SQN, 2 seeds", *["0.90 ± 0.14"] * 4]]
+    assert cells_of(lines[3]) == [["R2D2, 1 seed", *["0.50"] * 4]]
     assert lines[-1] == "SQN beats R2D2 with probability 1.00 [0.50, 1.00]."
+
+
+def test_a_record_without_std_ddof_holds_the_population_s_deviation() -> None:
+    """Two means 0.1 from theirs: 0.1 of the population, 0.1 x sqrt 2 of the sample."""
+    seed = entry("sqn", "maze", [0.9])
+    assert spread({**seed, "std_ddof": 0}) == pytest.approx(0.1 * 2**0.5)
+    assert spread({**seed, "std_ddof": 1}) == 0.1
+    four = entry("sqn", "maze", [0.8, 1.0])
+    assert spread({**four, "std_ddof": 0}) == pytest.approx(0.1 * (4 / 3) ** 0.5)
 
 
 def test_policies_stand_beside_the_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,12 +81,21 @@ def test_policies_stand_beside_the_paper(tmp_path: Path, monkeypatch: pytest.Mon
     results[3]["steps_over_oracle"] = None
     write(tmp_path, "pretrained_table.json", results, [])
     monkeypatch.setattr(common, "RESULTS", tmp_path)
-    table = readme_tables.policies().splitlines()
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
+    cells = cells_of(readme_tables.policies())
     assert cells[0] == ["", *maps]
-    assert cells[2] == ["`pretrained:best`", *["0.96, 123 (1.23)"] * 3, "0.96, 123"]
-    assert cells[7][1] == "0.96, 123", "the oracle is not held against itself"
-    assert cells[8] == ["paper, SQN", "0.98, 181", "0.99, 149", "0.93, 171", "0.82, 768"]
+    assert cells[2] == ["`pretrained:sqn`", *["0.96 ± 0.14, 123 (1.23)"] * 4]
+    assert cells[5] == [
+        "`pretrained:best`",
+        *["0.96 ± 0.14, 123 (1.23)"] * 3,
+        "0.96 ± 0.14, 123",
+    ]
+    assert cells[7][1] == "0.96 ± 0.14, 123", "the oracle is not held against itself"
+    paper = ["SQN in the paper", "0.98, 181", "0.99, 149", "0.93, 171", "0.82, 768"]
+    assert cells[8] == paper
+    short = cells_of(readme_tables.agents())
+    assert short[2] == ["SQN", *["0.96, 123"] * 4]
+    assert short[3] == paper
+    assert [row[0] for row in short[4:]] == ["R2D2", "R2D2 in the paper", "DQN", "DQN in the paper"]
 
 
 def test_only_what_is_between_the_marks_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
