@@ -21,9 +21,10 @@ from rooms import write_empty_room
 from experiments import robustness, table1
 from sqn_jax import report
 from sqn_jax.cli import main
+from sqn_jax.config.map_names import MapFile, ProjectMap, parse
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.figures import style
-from sqn_jax.maps import known_maps, split_names
+from sqn_jax.maps import known_maps
 from sqn_jax.policies import pretrained
 from sqn_jax.policies.run_policies import Policy, require_same_network
 from sqn_jax.report import render
@@ -176,8 +177,11 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def named_maps_exist(*names: str) -> None:
-    for name in (each for word in names for each in split_names(word)):
-        assert name in known_maps() or ":" in name or Path(name).is_file(), name
+    for name in (each for text in names for each in parse(text).names):
+        if isinstance(name, ProjectMap):
+            assert str(name) in known_maps()
+        if isinstance(name, MapFile):
+            assert Path(name.path).is_file()
 
 
 @pytest.fixture

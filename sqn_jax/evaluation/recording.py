@@ -3,7 +3,7 @@
 `record` goes from a policy and the name of a map to such episodes on the host. They come from
 `episodes.run_episodes`, that is from the compiled program of the evaluation. The points covered on
 the way are the only thing it does not put out, since they take up to several kB a step: the
-simulator's own functions count them again along the poses.
+simulator's own functions count them again along the poses, in a program of their own.
 """
 
 from __future__ import annotations
