@@ -34,7 +34,7 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
 """The two kinds of tasks, and the spawn mode that draws them."""
 
 SCHEMA = 2
-"""Of the evaluation file."""
+"""Of the evaluation file: 2 has sample standard deviations, 1 had the population's."""
 
 MOST_EPISODES, MOST_STEPS = 100_000, 100_000
 """Under one evaluation seed, and an episode: more would not fit into memory."""
@@ -280,8 +280,7 @@ def evaluate_agents(
             those who want the traces.
 
     Returns:
-        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode. Schema
-        1 had population standard deviations, 2 has those of the sample (`scores.describe`).
+        The evaluation file (`schema`, `results`, `comparisons`), and one record an episode.
     """
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
