@@ -33,9 +33,6 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
 }
 """The two kinds of tasks, and the spawn mode that draws them."""
 
-SCHEMA = 2
-"""Of the evaluation file: 2 has sample standard deviations, 1 had the population's."""
-
 MOST_EPISODES, MOST_STEPS = 100_000, 100_000
 """Under one evaluation seed, and an episode: more would not fit into memory."""
 
@@ -310,7 +307,7 @@ def evaluate_agents(
         for second in quiet
         if first != second and (told := scores.improvement(quiet[first], quiet[second]))
     ]
-    return {"schema": SCHEMA, "results": results, "comparisons": comparisons}, records
+    return {"schema": scores.SCHEMA, "results": results, "comparisons": comparisons}, records
 
 
 def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:

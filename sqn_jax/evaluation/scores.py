@@ -24,6 +24,9 @@ from sqn_jax.evaluation.statistics import (
 )
 from sqn_jax.training.rollout import EpisodeSummary
 
+SCHEMA = 2
+"""Of the evaluation file: 2 has sample standard deviations, 1 had the population's."""
+
 
 @dataclass(frozen=True)
 class Outcome:
