@@ -23,7 +23,7 @@ def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDA
 
     Args:
         blocked: [H, W] cells a ray cannot enter; the border must be blocked.
-        sectors: directions told apart, a multiple of 4; sector s covers the angles
+        sectors: directions distinguished, a multiple of 4; sector s covers the angles
             2 pi [s, s + 1) / sectors, counted from +x towards +y (increasing row).
         reach: longest rectangle along the direction, cells, at most 250.
 

@@ -1,4 +1,4 @@
-"""Domain randomisation: a world of its own for each of N robots (future work, section VII)."""
+"""Domain randomization: a world of its own for each of N robots (future work, section VII)."""
 
 from __future__ import annotations
 
