@@ -7,7 +7,7 @@ Same equations as `flax.linen.GRUCell` (Cho et al. 2014, reset gate after the pr
 
 Only U h depends on the step before. The input half is one matrix product over all steps, and the
 backward pass leaves just the three small products of a step in its loop: the gradients of both
-halves' matrices are gathered afterwards in a single large product each, from arrays with the three
+halves' matrices are gathered afterward in a single large product each, from arrays with the three
 gates side by side. Automatic differentiation would add up a [128, 384] matrix 400 times instead.
 
 On an NVIDIA GPU with enough memory the loops are two kernels (`gru_kernel`).
@@ -98,11 +98,13 @@ def scan_gru(projected: Array, carry: Array, hidden_kernel: Array, candidate_bia
 def _forward(
     projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array
 ) -> tuple[Array, tuple[Array, ...]]:
-    given = (projected, carry, split_gates(hidden_kernel), candidate_bias)
+    arguments = (projected, carry, split_gates(hidden_kernel), candidate_bias)
     if gru_kernel.fits(len(projected), carry.shape[-1]):
-        outputs = jax.lax.platform_dependent(*given, cuda=gru_kernel.forward, default=_scan_forward)
+        outputs = jax.lax.platform_dependent(
+            *arguments, cuda=gru_kernel.forward, default=_scan_forward
+        )
     else:
-        outputs = _scan_forward(*given)
+        outputs = _scan_forward(*arguments)
     hidden, *gates = outputs
     return hidden, (hidden, carry, hidden_kernel, *gates)
 
@@ -142,13 +144,13 @@ def _backward(
 ) -> tuple[Array, Array, Array, Array]:
     hidden, carry, hidden_kernel, *gates = saved
     previous = jnp.concatenate([carry[None], hidden[:-1]])
-    given = (hidden_gradient, previous, tuple(gates), split_gates(hidden_kernel))
+    arguments = (hidden_gradient, previous, tuple(gates), split_gates(hidden_kernel))
     if gru_kernel.fits(len(hidden), carry.shape[-1]):
         outputs = jax.lax.platform_dependent(
-            *given, cuda=gru_kernel.backward, default=_scan_backward
+            *arguments, cuda=gru_kernel.backward, default=_scan_backward
         )
     else:
-        outputs = _scan_backward(*given)
+        outputs = _scan_backward(*arguments)
     carry_gradient, to_projected, to_recurrent = outputs
     size = carry.shape[-1]
     rows = to_recurrent.reshape(-1, 3 * size)
@@ -165,10 +167,10 @@ def _scan_backward(
     rows = jnp.zeros((num_steps, shape[0], 3 * shape[1]), previous.dtype)
 
     def retreat(
-        carried: tuple[Array, Array, Array], given: tuple[Array, ...]
+        carried: tuple[Array, Array, Array], inputs: tuple[Array, ...]
     ) -> tuple[tuple[Array, Array, Array], None]:
         later, to_projected, to_recurrent = carried
-        step, gradient, before, reset, update, candidate, recurrent = given
+        step, gradient, before, reset, update, candidate, recurrent = inputs
         total = gradient + later
         to_candidate = total * (1 - update) * (1 - candidate * candidate)
         to_update = total * (before - candidate) * update * (1 - update)

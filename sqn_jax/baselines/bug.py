@@ -184,7 +184,7 @@ class _Robot:
             self.mode = "go"
             passes = self.distance * abs(math.sin(self.bearing)) < self.bug.config.goal_radius * 0.7
             straight = passes and abs(self.bearing) < math.pi / 4 and clear[0] >= self.needed
-            return 0.0 if straight else self._towards(self.bearing, clear)
+            return 0.0 if straight else self._toward(self.bearing, clear)
         if self.mode == "follow" and left.min() < self.nearest - PROGRESS:
             best = int(left.argmin())
             direction = self.heading + float(self.bug.directions[best])
@@ -194,16 +194,16 @@ class _Robot:
             offset = self.crossing_to - self.place
             self.crossing_left -= 1
             if abs(offset) > self.stride and self.crossing_left > 0:
-                return self._towards(cmath.phase(offset) - self.heading, clear)
+                return self._toward(cmath.phase(offset) - self.heading, clear)
             self.mode = "go"
         if self.mode == "go":
             hand, edge = self._nearer_edge(clear, ahead)
             self.hand = hand
             if edge is not None and left[edge] < self.distance - PROGRESS / 2:
-                return self._towards(float(self.bug.directions[edge]), clear)
+                return self._toward(float(self.bug.directions[edge]), clear)
             best = int(left.argmin())
             if left[best] < self.distance - CLOSE_UP:
-                return self._towards(float(self.bug.directions[best]), clear)
+                return self._toward(float(self.bug.directions[best]), clear)
             self.mode, self.wall = "follow", self.bearing
             self.visited.clear()
             self.nearest = min(self.nearest, float(left.min()))
@@ -270,9 +270,9 @@ class _Robot:
         direction = float(self.bug.directions[best])
         length = min(float(clear[best]), BREAK_OUT)
         self.crossing_to = self.place + cmath.rect(length, self.heading + direction)
-        return self._towards(direction, clear)
+        return self._toward(direction, clear)
 
-    def _towards(self, direction: float, clear: Floats) -> float:
+    def _toward(self, direction: float, clear: Floats) -> float:
         """The heading that is clear and nearest to a direction, the present one preferred."""
         if abs(wrap_angle(direction)) < STEADY * self.turn and clear[0] >= self.needed:
             return 0.0

@@ -6,7 +6,7 @@ simulator would grant it). All poses in the beam have taken equally many steps, 
 an estimate of what is left: the shortest path to the goal over the map, the turn toward that path,
 and the bends along it. Without noise a plan holds to the end, but for the rare move that the
 simulator's single precision refuses: it is then planned anew without that move. With noise on the
-velocity a short search mends the plan after each step. Beam search is not proven optimal: see
+velocity a short search repairs the plan after each step. Beam search is not proven optimal: see
 `tests/baselines/test_oracle.py` for how it stands to a full search on a lattice.
 """
 
@@ -48,7 +48,7 @@ class Oracle:
         self.search = BeamSearch(occupancy_map, env_params, goals)
         self.goals = goals
         self.steps_left = env_params.max_steps
-        self.mends = env_params.config.velocity_noise > 0
+        self.repairs = env_params.config.velocity_noise > 0
         self.arrived = np.zeros(len(goals), dtype=bool)
         self.actions: list[Ints] = [np.empty(0, np.int64)] * len(goals)
         self.planned: list[Floats] = [np.empty((0, 3))] * len(goals)
@@ -57,7 +57,7 @@ class Oracle:
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
         self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.search.goal_radius
-        if self.before is not None and not self.mends:
+        if self.before is not None and not self.repairs:
             self._note_refusals(poses, *self.before)
         lost = [i for i in np.flatnonzero(~self.arrived) if not self._is_on_plan(int(i), poses[i])]
         if lost:
@@ -81,9 +81,9 @@ class Oracle:
         return len(self.actions[robot]) > 0 and bool(_is_at(pose, self.planned[robot][0]))
 
     def _plan(self, robots: Ints, poses: Floats) -> None:
-        """Whole paths, with a wider beam if need be; under noise mended, except the first."""
+        """Whole paths, with a wider beam if need be; under noise repaired, except the first."""
         attempts = [(BEAM, self.steps_left), (4 * BEAM, self.steps_left)]
-        if self.mends and self.before is not None:
+        if self.repairs and self.before is not None:
             attempts = [(MENDING_BEAM, min(MENDING_STEPS, self.steps_left))]
         for width, steps in attempts:
             plans = self.search.plan(robots, poses, steps=steps, width=width)
@@ -96,7 +96,7 @@ class Oracle:
 
 
 class _Beam(NamedTuple):
-    """The poses [P] that the search goes on from; all have taken equally many steps."""
+    """The poses [P] that the search continues from; all have taken equally many steps."""
 
     robot: Ints
     """Whose they are."""
@@ -115,7 +115,7 @@ class _Beam(NamedTuple):
 
 
 class BeamSearch:
-    """Searches forward from given poses towards given goals, for many robots at once."""
+    """Searches forward from given poses toward given goals, for many robots at once."""
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
         config = env_params.config
@@ -155,8 +155,8 @@ class BeamSearch:
             For each robot its actions [S], the poses [S, 3] before each of them, and whether they
             lead to the goal; if not, they lead to the best place within `steps`.
         """
-        nobody = np.zeros(len(robots), np.int64)
-        beam = _Beam(np.arange(len(robots)), nobody, nobody, poses, nobody)
+        zeros = np.zeros(len(robots), np.int64)
+        beam = _Beam(np.arange(len(robots)), zeros, zeros, poses, zeros)
         beams, alive = [beam], beam.robot
         ends = np.zeros((len(robots), 2), np.int64)
         reached = np.zeros(len(robots), bool)
@@ -233,7 +233,7 @@ class BeamSearch:
         return order[rank < width]
 
     def is_clear(self, pose: Floats, distance: float) -> NDArray[np.bool_]:
-        """Whether the simulator grants a straight move of `distance` m (< 0 is back) from poses [N, 3].
+        """Whether a straight move of `distance` m (< 0 is backward) from poses [N, 3] is allowed.
 
         Slightly stricter: two lines, `SIDE_ROOM` to the left and right, must not meet a cell that
         is not free, and neither must the next millimeter.

@@ -1,7 +1,7 @@
 """Shortest paths over a map: how long they are, and how many steps a robot needs along them.
 
 Nothing is searched over headings here: what is left of a path is estimated from its length, the
-turn towards it and its bends, which steers the search of `oracle.Oracle`.
+turn toward it and its bends, which steers the search of `oracle.Oracle`.
 """
 
 from __future__ import annotations

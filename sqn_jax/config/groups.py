@@ -51,7 +51,7 @@ class EnvConfig:
     velocity_noise: float = 0.0
     """Sigma of Gaussian noise on the executed velocity."""
     velocity_noise_unit: Literal["relative", "absolute"] = "relative"
-    """Sigma as a share of (forward_speed, turn_rate), or in m/s and rad/s."""
+    """Sigma as a fraction of (forward_speed, turn_rate), or in m/s and rad/s."""
     range_noise: float = 0.0
     """Half-width p of the uniform noise on the observed ranges."""
     range_noise_unit: Literal["relative", "absolute"] = "relative"
@@ -106,7 +106,7 @@ class RandomizationConfig:
     range_noise: float = 0.0
     """Half-width of each robot's range noise, from 0 to this; in place of `env.range_noise`."""
     speed: float = 0.0
-    """Each robot's speeds and turn rate are up to this share faster or slower."""
+    """Each robot's speeds and turn rate are up to this fraction faster or slower."""
     mirror: bool = False
     """Half of the robots live in the mirror image of the map."""
 
@@ -150,7 +150,7 @@ class ReplayConfig:
     importance_exponent: float = 0.6
     """Exponent of the importance-sampling weights (R2D2, table 2)."""
     max_priority_weight: float = 0.9
-    """Priority of a sequence: this share of the largest TD error, the rest of the mean one."""
+    """Priority of a sequence: this fraction of the largest TD error, the rest of the mean one."""
 
     def __post_init__(self) -> None:
         require(self.capacity >= 1, "replay.capacity", self.capacity, "at least 1")
@@ -196,7 +196,7 @@ class LearnerConfig:
     trace_decay: float = 0.8
     """pqn: lambda of the Q(lambda) returns."""
     average_share: float = 0.0
-    """pqn: evaluate the parameters averaged over the last share of all updates; 0: the latest."""
+    """pqn: evaluate the parameters averaged over this last fraction of updates; 0: the latest."""
     window_length: int = 0
     """pqn: steps between updates, a divisor of the episode; 0 is the whole episode."""
     num_passes: int = 1
@@ -216,8 +216,8 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             require(value >= 0, f"learner.{name}", value, "0 or a positive number")
-        shares = ("trace_decay", "average_share", "advantage_learning")
-        for name in ("discount", "discount_start", *shares):
+        fractions = ("trace_decay", "average_share", "advantage_learning")
+        for name in ("discount", "discount_start", *fractions):
             value = getattr(self, name)
             require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         value = self.target_update_rate

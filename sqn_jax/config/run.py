@@ -58,7 +58,7 @@ class TrainConfig:
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints; one is always written at the end."""
     checkpoint_replay: bool = True
-    """r2d2: save the replay, too; else a run goes on from an empty one, not as it would have."""
+    """r2d2: save the replay, too; else a run resumes with an empty one, and differs."""
     max_skipped_updates: int = 100
     """Stop once more updates than this had a loss or gradient that is not finite."""
     env: EnvConfig = field(default_factory=EnvConfig)

@@ -9,7 +9,7 @@ End: never terminated; truncated after `max_steps` steps. Reaching the goal does
 episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
 
 Everything is for one robot; `jax.vmap` makes many. Positions are in meters from the map's lower
-left corner, headings in radians from +x towards +y.
+left corner, headings in radians from +x toward +y.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Info = dict[str, Array]
 def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A).
 
-    Of a map that holds several, both lie in the same. A share of the tasks, none by default, has
+    Of a map that holds several, both lie in the same. A fraction of the tasks, none by default, has
     its goal near one of the closest spawn points.
     """
     keys = jax.random.split(key, 7)

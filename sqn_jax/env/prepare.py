@@ -160,15 +160,15 @@ def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> 
     Raises:
         ValueError: a level is negative or not finite.
     """
-    given = dataclasses.replace(
+    env_config = dataclasses.replace(
         params.config, velocity_noise=velocity_noise, range_noise=range_noise
     )
     compiled_in = dataclasses.replace(
-        given, velocity_noise=float(velocity_noise > 0), range_noise=float(range_noise > 0)
+        env_config, velocity_noise=float(velocity_noise > 0), range_noise=float(range_noise > 0)
     )
     return dataclasses.replace(
         params,
-        velocity_noise=_velocity_noise(given),
+        velocity_noise=_velocity_noise(env_config),
         range_noise=jnp.float32(range_noise),
         config=compiled_in,
     )

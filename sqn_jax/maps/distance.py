@@ -216,7 +216,7 @@ def goal_distance(
     graph = sparse.csr_matrix(
         (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(nodes, nodes)
     )
-    # The goals' own edges lead outwards only, so no path can use a goal as a shortcut.
+    # The goals' own edges lead outward only, so no path can use a goal as a shortcut.
     lengths = csgraph.dijkstra(graph, directed=True, indices=np.arange(count, nodes))
     distance = np.full((len(flat_goals), *free.shape), np.inf, dtype=np.float32)
     distance[:, free] = lengths[:, :count] * resolution

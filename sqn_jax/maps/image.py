@@ -21,8 +21,8 @@ _TEXT_KINDS = (b"P1", b"P2", b"P3")
 # See `suspicious_level`.
 _UNKNOWN_GRAY = 205  # of 255
 _NEAR_THRESHOLD = 0.1
-_LARGE_SHARE = 0.2
-_UNKNOWN_SHARE = 0.01
+_LARGE_FRACTION = 0.2
+_UNKNOWN_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -172,11 +172,11 @@ def suspicious_level(image: GrayImage, thresholds: Thresholds) -> str | None:
         return None
     near &= occupancy > occupancy[free].min()
     level = int(np.argmax(np.where(near, pixels, 0)))
-    share = pixels[level] / pixels[free].sum()
+    fraction = pixels[level] / pixels[free].sum()
     is_unknown_gray = round(level * 255 / image.white) == _UNKNOWN_GRAY
-    if not near[level] or share <= (_UNKNOWN_SHARE if is_unknown_gray else _LARGE_SHARE):
+    if not near[level] or fraction <= (_UNKNOWN_FRACTION if is_unknown_gray else _LARGE_FRACTION):
         return None
     return (
-        f"gray {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {share:.0%} of "
+        f"gray {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {fraction:.0%} of "
         f"the free space: if it means unknown, lower free_thresh from {thresholds.free_thresh:g}"
     )

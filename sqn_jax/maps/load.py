@@ -41,7 +41,7 @@ def load_map(
         name = parse(name)
     elif not isinstance(name, MapSet):
         name = MapSet((name,), (1,))
-    maps = [_load_one(each, robot_radius, allow_outside) for each in name.names]
+    maps = [_load_one(part, robot_radius, allow_outside) for part in name.names]
     if len(maps) == 1:
         return maps[0]
     joined = side_by_side(maps, str(name), name.weights)

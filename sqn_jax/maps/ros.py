@@ -79,8 +79,8 @@ def load_map_file(
     Args:
         name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI, 1 m a cell) .map.
         robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
-        allow_outside: let a YAML file name an image outside its own folder, by a path that leads out
-            of it or by a link. It must still be a PNG or PNM file of the usual size.
+        allow_outside: let a YAML file name an image outside its own folder, by a path that leads
+            out of it or by a link. It must still be a PNG or PNM file of the usual size.
 
     Returns:
         The map, points in the grid frame.

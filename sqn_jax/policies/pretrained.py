@@ -122,5 +122,5 @@ def _tree(arrays: Mapping[str, Any], config: TrainConfig, name: str) -> Any:
         shape = arrays[path].shape if path in arrays else None
         if wanted != shape:
             raise ValueError(f"policy {name}: array {path} is {shape}, expected {wanted}")
-    given = {path: jnp.asarray(array, expected[path].dtype) for path, array in arrays.items()}
-    return traverse_util.unflatten_dict(given, sep="/")
+    loaded = {path: jnp.asarray(array, expected[path].dtype) for path, array in arrays.items()}
+    return traverse_util.unflatten_dict(loaded, sep="/")

@@ -175,7 +175,7 @@ class Checkpoints:
     def _restored(self, chunk: int, description: Manifest, shapes: dict[str, Any]) -> Any:
         """Trees of the given shapes; on the first device where these do not name any.
 
-        Wherever the arrays lay when they were saved: a run on two devices goes on on one.
+        Wherever the arrays lay when they were saved: a run on two devices can resume on one.
         """
         place = self._place(chunk)
         rows = manifest.differences(description, self._origin, shapes)
@@ -254,7 +254,7 @@ class Checkpoints:
 def _require_space(folder: Path, items: dict[str, Any]) -> None:
     """Refuse to begin what a disk has no room for.
 
-    Orbax's file library goes on writing in threads of its own after a write has failed, and each
+    Orbax's file library continues to write in threads of its own after a write has failed, and each
     of them prints a traceback.
     """
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items)) + OVERHEAD_BYTES

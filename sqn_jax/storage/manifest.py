@@ -74,7 +74,7 @@ class Manifest:
 
     @property
     def is_exact(self) -> bool:
-        """Whether a run goes on from it exactly as it would have."""
+        """Whether a run resumes from it exactly as it would have gone on."""
         return bool(self.contents["exact"])
 
     @property

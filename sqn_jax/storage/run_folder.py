@@ -88,7 +88,7 @@ class RunFolder:
         write_whole(self.path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
 
     def unfinish(self) -> None:
-        """Take away what says that the run is finished: it goes on."""
+        """Remove the mark that the run is finished: it is resumed."""
         (self.path / SUMMARY).unlink(missing_ok=True)
 
     def append_metrics(self, row: Mapping[str, Any]) -> None:

@@ -48,7 +48,7 @@ def require(kind: str | None) -> None:
     """Choose the kind of device before JAX starts its devices, and see that there is one.
 
     Args:
-        kind: "cpu", "gpu" or "tpu"; None takes what there is, an accelerator before the CPU.
+        kind: "cpu", "gpu" or "tpu"; None takes an accelerator if there is one, else the CPU.
 
     Raises:
         ValueError: there is none of this kind, or none that JAX may use.
