@@ -28,13 +28,13 @@ from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 
 FINENESS = 3
 """Directions looked at for each turn of one step."""
-SIDE_ROOM = 0.06
+SIDE_CLEARANCE = 0.06
 """Clearance from obstacles, m, at each side."""
-WALL_ROOM = 0.2
+WALL_CLEARANCE = 0.2
 """The same while following a wall: narrower notches are passed by, the robot could not turn."""
 STEADY = 0.75
 """Turns that a heading may be off before it is corrected; half a turn cannot be helped."""
-FRONT_ROOM = 0.05
+FRONT_CLEARANCE = 0.05
 """m of free space beyond the end of a move."""
 GRAZING = 0.35
 """A point farther aside than this, cosine, is passed and not met, however near it is."""
@@ -92,14 +92,14 @@ class BugNavigator:
         seen = zip(self.robots, readings, clear, distance, heading, strict=True)
         return np.array([robot.choose(*what) for robot, *what in seen])
 
-    def clear_lengths(self, readings: Floats, side_room: float = SIDE_ROOM) -> Floats:
+    def clear_lengths(self, readings: Floats, side_clearance: float = SIDE_CLEARANCE) -> Floats:
         """How far [E, D] m robots could move in each direction by readings [E, R] m.
 
         Args:
             readings: what the beams show, m.
-            side_room: m to keep from obstacles at each side.
+            side_clearance: m to keep from obstacles at each side.
         """
-        width = self.config.robot_radius + side_room
+        width = self.config.robot_radius + side_clearance
         away = readings.astype(np.float32)[:, None]
         ahead, aside = away * self._ahead, away * self._aside
         hit = (
@@ -122,7 +122,7 @@ class _Robot:
         self.turn = config.turn_rate * config.time_step
         self.stride = config.forward_speed * config.time_step
         self.reverse = config.backward_speed * config.time_step
-        self.needed = self.stride + FRONT_ROOM
+        self.needed = self.stride + FRONT_CLEARANCE
         # Dead reckoning from commands; complex numbers are places, in the frame of the start.
         self.heading, self.place = 0.0, 0j
         self.goal: complex | None = None
@@ -158,7 +158,7 @@ class _Robot:
 
     def _escape(self, clear: Floats) -> int:
         """What is left when no direction is clear enough to move."""
-        if clear[self.count // 2] >= self.reverse + FRONT_ROOM:
+        if clear[self.count // 2] >= self.reverse + FRONT_CLEARANCE:
             self.place -= cmath.rect(self.reverse, self.heading)
             return BACKWARD
         return STAND
@@ -242,7 +242,7 @@ class _Robot:
             self.wall = float(self.bug.beams[near[readings[near].argmin()]])
         first = round(self.wall / self.turn)
         headings = (first + self.hand * np.arange(self.count // FINENESS)) * FINENESS % self.count
-        wide = self.bug.clear_lengths(readings[None], WALL_ROOM)[0]
+        wide = self.bug.clear_lengths(readings[None], WALL_CLEARANCE)[0]
         turned = self.bug.directions[headings] + self.heading - self.last_heading
         onward = np.cos(turned) > math.cos(math.pi - RETURN)
         # In a notch the nearest wall may be the one left behind: back only if nothing else is.

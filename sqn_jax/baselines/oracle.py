@@ -31,12 +31,12 @@ INVERSE = np.array([-1, BACKWARD, FORWARD, RIGHT, LEFT])
 
 BEAM = 100
 """Poses per episode and step while the whole path is planned."""
-MENDING_BEAM = 40
-MENDING_STEPS = 14
+REPAIR_BEAM = 40
+REPAIR_STEPS = 14
 """Size of the search after a step that led elsewhere than planned."""
 ON_PLAN = 1e-3
 """A pose this near to the planned one, m and rad, is the planned one."""
-SIDE_ROOM = 1e-3
+SIDE_MARGIN = 1e-3
 """m that a planned move keeps from obstacles, so that float32 in the simulator agrees."""
 
 
@@ -84,7 +84,7 @@ class Oracle:
         """Whole paths, with a wider beam if need be; under noise repaired, except the first."""
         attempts = [(BEAM, self.steps_left), (4 * BEAM, self.steps_left)]
         if self.repairs and self.before is not None:
-            attempts = [(MENDING_BEAM, min(MENDING_STEPS, self.steps_left))]
+            attempts = [(REPAIR_BEAM, min(REPAIR_STEPS, self.steps_left))]
         for width, steps in attempts:
             plans = self.search.plan(robots, poses, steps=steps, width=width)
             for robot, (actions, planned, _) in zip(robots, plans, strict=True):
@@ -235,7 +235,7 @@ class BeamSearch:
     def is_clear(self, pose: Floats, distance: float) -> NDArray[np.bool_]:
         """Whether a straight move of `distance` m (< 0 is backward) from poses [N, 3] is allowed.
 
-        Slightly stricter: two lines, `SIDE_ROOM` to the left and right, must not meet a cell that
+        Slightly stricter: two lines, `SIDE_MARGIN` to the left and right, must not meet a cell that
         is not free, and neither must the next millimeter.
         """
         direction = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1) * np.sign(distance)
@@ -245,10 +245,10 @@ class BeamSearch:
         )
         row = np.clip(row, 0, self.free.shape[0] - 1)
         col = np.clip(col, 0, self.free.shape[1] - 1)
-        clear = self.clearance[row, col] > length / 2 + SIDE_ROOM
+        clear = self.clearance[row, col] > length / 2 + SIDE_MARGIN
         near = np.flatnonzero(~clear)
         start, ahead = pose[near, :2], direction[near]
-        aside = SIDE_ROOM * np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+        aside = SIDE_MARGIN * np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
         clear[near] = self._line_is_free(start + aside, ahead * length)
         clear[near] &= self._line_is_free(start - aside, ahead * length)
         return clear
