@@ -59,7 +59,7 @@ class Lattice:
     width: float
     """Extent of the map along x, m."""
     cell: float
-    """Distance of neighbouring points, m."""
+    """Distance of neighboring points, m."""
     max_range: float
     """Farthest reading of the sensor, m."""
     origin: tuple[float, float]
@@ -71,7 +71,7 @@ class Lattice:
 
     @classmethod
     def over(cls, height_m: float, width_m: float, cell: float, max_range: float) -> Self:
-        """The lattice for a map of `height_m` x `width_m` metres."""
+        """The lattice for a map of `height_m` x `width_m` meters."""
         corners = _turn(np.array([0.0, width_m, 0.0, width_m]), np.array([0, 0, 1, 1]) * height_m)
         left, bottom = (math.floor(axis.min() / cell) - 1 for axis in corners)
         columns, rows = (
@@ -214,7 +214,7 @@ def _sectors(heading: Array, reaches: Array, field_of_view: float) -> Array:
 def _sector_limits(num_beams: int, field_of_view: float) -> tuple[NDArray[np.float32], int]:
     """Where the sectors begin, rad from the heading, and how many can touch a half-plane.
 
-    One sector a beam, its neighbours halfway; those of the outermost beams end at the field of
+    One sector a beam, its neighbors halfway; those of the outermost beams end at the field of
     view. The last of the [R + 1] sectors is what lies beyond it and cannot be seen.
     """
     spacing = field_of_view / (num_beams - 1)
@@ -306,7 +306,7 @@ def _draw_block(
 def _power(number: Array) -> Array:
     """2 to the number, rounded and clipped to 0..`ROW_BITS`, uint32."""
     clipped = smaller(larger(number, 0.0), float(ROW_BITS))
-    # The mask changes nothing but tells the compiler that no shift is too long.
+    # The mask changes nothing but shows the compiler that no shift is too long.
     return jnp.uint32(1) << (to_integer(clipped).astype(jnp.uint32) & 31)
 
 

@@ -13,12 +13,12 @@ from sqn_jax.evaluation.compare import Settings
 from sqn_jax.report.content import Run, gather, read_runs
 from sqn_jax.report.page import require_writable, to_html, write
 from sqn_jax.report.pictures import draw
-from sqn_jax.storage.compile_cache import kept_programs
+from sqn_jax.storage.compile_cache import cached_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 
 
-@kept_programs()
+@cached_programs()
 def write_report(
     runs: Sequence[Run], settings: Settings, out: Path, *, references: bool = True
 ) -> None:
