@@ -64,7 +64,7 @@ def parse_plan(plan: str, size: int) -> tuple[NDArray[np.bool_], list[NDArray[np
 
     Returns:
       occupied: bool [size, size], row 0 at the bottom.
-      marked, all_cells: the centres (x, y) [.., 2] in m of the plan's cells marked `*`, and of all.
+      marked, all_cells: the centers (x, y) [.., 2] in m of the plan's cells marked `*`, and of all.
     """
     lines = plan.strip("\n").splitlines()[::-1]
     count = len(lines) // 2

@@ -34,9 +34,9 @@ def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _runs_of(path: Path) -> list[dict[str, Any]]:
-    told = json.loads(path.read_text("utf-8"))
-    if "card" in told:
-        before = told["card"]
+    contents = json.loads(path.read_text("utf-8"))
+    if "card" in contents:
+        before = contents["card"]
         facts = ("training_episodes", "training_minutes", "device")
         last = {"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts}
         return [*before["went_on_from"], last]
@@ -48,7 +48,7 @@ def _runs_of(path: Path) -> list[dict[str, Any]]:
             "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
             "device": run["summary"]["device"],
         }
-        for run in told["runs"]
+        for run in contents["runs"]
     ]
 
 
