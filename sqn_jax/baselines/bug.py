@@ -133,23 +133,23 @@ class _Robot:
         self.crossing_to, self.crossing_left = 0j, 0
         self.last_heading = math.pi  # heading of the last move
         self.visited: set[tuple[int, ...]] = set()  # poses while following, rounded
-        self.turns_left, self.then_drive = 0, False
+        self.turns_left, self.then_forward = 0, False
 
     def choose(self, readings: Floats, clear: Floats, distance: float, heading: float) -> int:
         """One action from readings [R] m, clear lengths [D] m and where the goal is, m and rad."""
         self._locate_goal(distance, heading)
-        if not self.turns_left and not (self.then_drive and clear[0] >= self.needed):
+        if not self.turns_left and not (self.then_forward and clear[0] >= self.needed):
             direction = self._decide(readings, clear)
             self.turns_left = round(math.remainder(direction, 2 * math.pi) / self.turn)
         if self.turns_left:
             # The move belongs to the turn: without it two choices could alternate on the spot.
-            self.then_drive = True
+            self.then_forward = True
             sign = 1 if self.turns_left > 0 else -1
             self.turns_left -= sign
             self.heading += sign * self.turn
             self.wall -= sign * self.turn
             return LEFT if sign > 0 else RIGHT
-        self.then_drive = False
+        self.then_forward = False
         if clear[0] < self.needed:
             return self._escape(clear)
         self.place += cmath.rect(self.stride, self.heading)

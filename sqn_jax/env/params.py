@@ -73,7 +73,7 @@ class EnvState:
     goal: Array
     """[2] x m, y m."""
     covered: Array
-    """[words, groups, group_rows] uint32: the points seen so far, one a bit; see `Lattice`."""
+    """[bitmasks, groups, group_rows] uint32: the points seen so far, one a bit; see `Lattice`."""
     step: Array
     """int32: steps taken."""
 

@@ -1,6 +1,6 @@
 """Saving and loading the state of a run with Orbax.
 
-A checkpoint holds the whole `RunnerState`: parameters, optimiser, replay, keys and the round, and a
+A checkpoint holds the whole `RunnerState`: parameters, optimizer, replay, keys and the round, and a
 manifest (`manifest.py`) that is compared with it before anything is used. The parameters of the
 policy stand apart, so that it can be loaded without the rest; so does the replay, which can be left
 out.

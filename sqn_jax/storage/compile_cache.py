@@ -63,7 +63,7 @@ def cached_programs() -> Iterator[None]:
     for name, value in options.items():
         jax.config.update(name, value)
     try:
-        with _sealed(folder), _told_in_one_line(folder):
+        with _sealed(folder), _warnings_in_one_line(folder):
             yield
     finally:
         for name, value in before.items():
@@ -176,7 +176,7 @@ def _digest(path: Path) -> bytes:
 
 
 @contextmanager
-def _told_in_one_line(folder: Path) -> Iterator[None]:
+def _warnings_in_one_line(folder: Path) -> Iterator[None]:
     """Report the first program that JAX cannot read or write, and delete the files of each."""
     troubles: set[str] = set()
     with warnings.catch_warnings():
