@@ -49,8 +49,8 @@ FAR = 1e9
 class Lattice:
     """Where the points of a map lie and how they are stored; static.
 
-    In the lattice's own frame, in cells, point m of row n is at (m, n). Bitmasks of 32 points fill a
-    `covered` array [bitmasks, groups, group_rows] uint32: bit b of `covered[k, g, p]` is point
+    In the lattice's own frame, in cells, point m of row n is at (m, n). Bitmasks of 32 points fill
+    a `covered` array [bitmasks, groups, group_rows] uint32: bit b of `covered[k, g, p]` is point
     32 k + b of row g x group_rows + p.
     """
 
@@ -100,7 +100,7 @@ class Lattice:
 
     @property
     def stride(self) -> int:
-        """Bitmasks are numbered group by group, with a number between groups that stands for none."""
+        """Bitmasks are numbered group by group; one number between two groups stands for none."""
         return self.num_bitmasks + 1
 
     def points(self) -> NDArray[np.float64]:
@@ -243,8 +243,8 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
     row's place on the map needs no look-up, only the right group.
 
     Returns:
-        For W bitmasks of `ROW_BITS` points of each row in reach: which bitmask of the lattice, counted
-        with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it [W]
+        For W bitmasks of `ROW_BITS` points of each row in reach: which bitmask of the lattice,
+        counted with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it [W]
         uint32; and the points that are seen, W times [2, group_rows] uint32.
     """
     radius = lattice.max_range / lattice.cell
@@ -286,7 +286,7 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
 def _draw_block(
     begin: Array, bitmasks: list[Array], sectors: Array, *, rows: Array, starts: Array, block: int
 ) -> tuple[Array, list[Array]]:
-    """Add a block of sectors to the bitmasks; returns where the last one ended, and the bitmasks."""
+    """Add a block of sectors to the bitmasks; returns the end of the last one, and the bitmasks."""
     squares = rows * rows
     for sector in range(block):
         end = rows * sectors[:2, sector, None]
