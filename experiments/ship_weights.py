@@ -25,7 +25,7 @@ from sqn_jax.policies.pretrained import find_policy, write_policy
 from sqn_jax.policies.run_policies import Policy, load_policy, require_same_network
 from sqn_jax.storage.run_folder import RunFolder
 
-WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
+WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "policies" / "weights"
 
 
 def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:

@@ -38,7 +38,10 @@ PAGES = sorted(
     [
         *(README, ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")),
         *(ROOT / "experiments" / "README.md", RECORDS / "README.md"),
-        *(ROOT / "notebooks" / "README.md", ROOT / "sqn_jax" / "weights" / "README.md"),
+        *(
+            ROOT / "notebooks" / "README.md",
+            ROOT / "sqn_jax" / "policies" / "weights" / "README.md",
+        ),
     ]
 )
 MOST_WORDS = 900

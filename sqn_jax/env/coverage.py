@@ -244,8 +244,8 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
 
     Returns:
         For W bitmasks of `ROW_BITS` points of each row in reach: which bitmask of the lattice,
-        counted with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it [W]
-        uint32; and the points that are seen, W times [2, group_rows] uint32.
+        counted with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it
+        [W] uint32; and the points that are seen, W times [2, group_rows] uint32.
     """
     radius = lattice.max_range / lattice.cell
     places = jnp.arange(lattice.group_rows, dtype=jnp.float32)

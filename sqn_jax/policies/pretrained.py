@@ -112,7 +112,7 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
 
 
 def _folder() -> Traversable:
-    return resources.files("sqn_jax") / "weights"
+    return resources.files("sqn_jax.policies") / "weights"
 
 
 def _tree(arrays: Mapping[str, Any], config: TrainConfig, name: str) -> Any:
