@@ -191,10 +191,10 @@ def _hardest(hardest: Sequence[HardEpisode], pictures: Sequence[Illustration]) -
 def _in_short(hard: HardEpisode) -> str:
     if hard.success:
         return f"reached, in {hard.slowness:.1f} times the steps of the shortest way"
-    return f"{_metres(hard.left)} of way left"
+    return f"{_meters(hard.left)} of way left"
 
 
-def _metres(length: float) -> str:
+def _meters(length: float) -> str:
     return f"{length:.1f} m" if np.isfinite(length) else "no end"
 
 
@@ -207,7 +207,7 @@ def words(hard: HardEpisode) -> str:
     if hard.success:
         end = (
             f"The goal was reached after {hard.steps:,} steps, {hard.slowness:.1f} times as many "
-            f"as the shortest way of {_metres(hard.way)} takes at full speed. Of these steps "
+            f"as the shortest way of {_meters(hard.way)} takes at full speed. Of these steps "
             f"{place.steps:,} were spent {there}."
         )
     else:
@@ -215,8 +215,8 @@ def words(hard: HardEpisode) -> str:
         if not place.is_most:
             stuck = f"The robot got stuck nowhere for long: at most it spent {share} {there}."
         end = (
-            f"The goal was not reached within {hard.steps:,} steps. {stuck} {_metres(hard.left)} "
-            f"of way were left, of {_metres(hard.way)} from the start."
+            f"The goal was not reached within {hard.steps:,} steps. {stuck} {_meters(hard.left)} "
+            f"of way were left, of {_meters(hard.way)} from the start."
         )
     moves = {0: "No move was", 1: "1 move was"}.get(hard.refused, f"{hard.refused:,} moves were")
     return (

@@ -100,9 +100,9 @@ def _hard_picture(hard: HardEpisode) -> Illustration:
 def _mark(axes: Any, place: Place, *, stuck: bool) -> None:
     """A circle around a place, with a word above it or, near the upper edge, below it."""
     turn = np.linspace(0, 2 * np.pi, 100)
-    for colour, width in ((_PAPER, 4.5), (_INK, 2.0)):
+    for color, width in ((_PAPER, 4.5), (_INK, 2.0)):
         x, y = place.x + NEAR * np.cos(turn), place.y + NEAR * np.sin(turn)
-        axes.plot(x, y, color=colour, lw=width, zorder=8)
+        axes.plot(x, y, color=color, lw=width, zorder=8)
     (left, right), (_, top) = axes.get_xlim(), axes.get_ylim()
     above = place.y + NEAR < 0.9 * top
     across = (place.x - left) / (right - left)

@@ -35,7 +35,7 @@ def require_sound(
 
     Raises:
         Diverged: more updates were skipped than the config allows, or parameters or the
-            optimiser's moments are not finite.
+            optimizer's moments are not finite.
     """
     skipped, finite = np.atleast_1d(row["skipped_updates"]), np.atleast_1d(row["finite"])
     lost = (skipped > config.max_skipped_updates) | ~finite
