@@ -11,7 +11,9 @@ from typing import Any
 
 from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.config.presets import PRESETS
-from sqn_jax.evaluation.compare import Settings, load_maps, with_references
+from sqn_jax.evaluation.agents import with_baselines
+from sqn_jax.evaluation.compare import load_maps
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.runs.signals import Interrupted, end_at_once
 from sqn_jax.runs.train import train_session
 from sqn_jax.storage.checkpoint import NotSaved
@@ -60,7 +62,7 @@ def prepare(options: argparse.Namespace, settings: Settings) -> tuple[list[Path]
 
     What would be refused afterwards, an unusable map or folder, is refused before.
     """
-    load_maps(with_references([], references=True), settings)
+    load_maps(with_baselines([], baselines=True), settings)
     out: Path = options.out or runs_folder(options)
     out.mkdir(parents=True, exist_ok=True)
     return train_missing(options), out
@@ -100,7 +102,7 @@ def _train(config: TrainConfig, folder: Path) -> None:
     if (folder / "summary.json").is_file():
         print(f"{folder} is trained")
         return
-    train_session(config, folder, resume=begun, go_on="the same command")
+    train_session(config, folder, resume=begun, resume_command="the same command")
 
 
 def run(main: Any) -> None:

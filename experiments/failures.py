@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common import run
-from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.runs.evaluate import evaluate_session
 from sqn_jax.storage.files import write_json
@@ -68,7 +69,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
-    agents = [Learnt(word, (find_policy(word),)) for word in options.policies]
+    agents = [TrainedAgent(word, (find_policy(word),)) for word in options.policies]
     by_policy = {}
 
     def keep(batch: EpisodeBatch) -> None:

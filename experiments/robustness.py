@@ -17,8 +17,9 @@ from experiments.common import (
     run,
 )
 from sqn_jax import figures
-from sqn_jax.evaluation.compare import Settings, group_policies
+from sqn_jax.evaluation.agents import group_policies
 from sqn_jax.evaluation.scores import results_table
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs.evaluate import evaluate_session
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from experiments.common import run
 from sqn_jax.agent.trajectory import Trajectory
-from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy
@@ -66,7 +67,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    agents = [Learnt(name, (it,)) for name, it in variants(find_policy(options.policy)).items()]
+    policies = variants(find_policy(options.policy))
+    agents = [TrainedAgent(name, (policy,)) for name, policy in policies.items()]
     settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
     by_map: dict[str, Any] = {}
 

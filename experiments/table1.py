@@ -20,9 +20,10 @@ from experiments.common import (
 )
 from sqn_jax import figures
 from sqn_jax.config.presets import PAPER_MAPS
-from sqn_jax.evaluation.compare import Settings, group_policies, with_references
+from sqn_jax.evaluation.agents import group_policies, with_baselines
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table, results_table
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs.evaluate import evaluate_session
 from sqn_jax.storage.run_folder import RunFolder
@@ -98,8 +99,8 @@ def main() -> None:
         curves.setdefault(config.algo.upper(), []).append(run_folder.read_metrics())
     figure = figures.learning_curves(curves, title=f"Training, preset {options.preset}")
     figures.save(figure, out / "learning_curves.png")
-    learnt = group_policies([load_policy(folder) for folder in folders])
-    agents = with_references(learnt, references=True)
+    trained = group_policies([load_policy(folder) for folder in folders])
+    agents = with_baselines(trained, baselines=True)
     evaluation = evaluate_session(agents, settings, out / "table1.json")
     page = report(evaluation, settings)
     (out / "table1.md").write_text(page, encoding="utf-8")

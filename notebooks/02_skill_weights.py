@@ -31,9 +31,11 @@ import numpy as np
 
 from sqn_jax import figures
 from sqn_jax.env import ACTION_NAMES
-from sqn_jax.evaluation.compare import Learnt, Settings, evaluate_agents, load_maps
+from sqn_jax.evaluation.agents import TrainedAgent
+from sqn_jax.evaluation.compare import evaluate_agents, load_maps
 from sqn_jax.evaluation.recording import record
 from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.evaluation.statistics import bootstrap_interval
 from sqn_jax.maps import goal_fields, points_to_cells, traversable
 from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
@@ -271,7 +273,7 @@ variants = {
     "one half each": fix_skill_weights(policy, (0.5, 0.5)),
     "exchanged": swap_skills(policy),
 }
-agents = [Learnt(name, (variant,)) for name, variant in variants.items()]
+agents = [TrainedAgent(name, (variant,)) for name, variant in variants.items()]
 settings = Settings(
     MAPS,
     episodes=EPISODES,

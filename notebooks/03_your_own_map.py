@@ -30,8 +30,10 @@ from pathlib import Path
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.evaluation.compare import Learnt, Settings, evaluate_agents, load_maps, with_references
+from sqn_jax.evaluation.agents import TrainedAgent, with_baselines
+from sqn_jax.evaluation.compare import evaluate_agents, load_maps
 from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import describe, load_map
 from sqn_jax.policies.pretrained import find_policy
 
@@ -175,8 +177,8 @@ def measure(agents, *maps):
     print(markdown_table(header, rows))
 
 
-sqn = Learnt("sqn", (policy,))
-measure([sqn] if SMALL else with_references([sqn], references=True), str(path))
+sqn = TrainedAgent("sqn", (policy,))
+measure([sqn] if SMALL else with_baselines([sqn], baselines=True), str(path))
 
 # %% [markdown]
 # Its paths, failures first.
@@ -235,7 +237,7 @@ def with_robot(name, **changes):
     """The policy in another robot, under another name."""
     env = dataclasses.replace(policy.config.env, **changes)
     changed = dataclasses.replace(policy, config=dataclasses.replace(policy.config, env=env))
-    return Learnt(name, (changed,))
+    return TrainedAgent(name, (changed,))
 
 
 half = {"forward_speed": 1.25, "backward_speed": 0.625}

@@ -27,8 +27,10 @@ from collections import Counter
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.evaluation.compare import Learnt, Reference, Settings, evaluate_agents, load_maps
+from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
+from sqn_jax.evaluation.compare import evaluate_agents, load_maps
 from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.pretrained import find_policy, pretrained_names
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
@@ -55,9 +57,9 @@ NOISES = [QUIET, VELOCITY[-1], RANGES[-1]] if SMALL else [QUIET, *VELOCITY, *RAN
 names = ["sqn"] if SMALL else [n for n in ("sqn", "r2d2", "dqn") if n in pretrained_names()]
 policies = {name: find_policy(f"pretrained:{name}") for name in names}
 robot = policies["sqn"].config.env
-agents = [Learnt(name, (policy,)) for name, policy in policies.items()]
+agents = [TrainedAgent(name, (policy,)) for name, policy in policies.items()]
 if not SMALL:
-    agents.append(Reference("bug", robot))
+    agents.append(BaselineAgent("bug", robot))
 for name, policy in policies.items():
     config = policy.config
     print(f"{name}: trained on {config.map} for {config.total_episodes:,} episodes,", end=" ")

@@ -1,11 +1,11 @@
 """The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`.
 
-It wires arguments to functions, no more.
+It only passes arguments to functions.
 
-Exit codes: 0 done, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
-143 and 129 as a shell sees them: stopped by SIGINT, SIGTERM or SIGHUP, after saving where there was
-something to save. Where not, the signal itself ends the process, at once, which a parent that is
-no shell sees as such (-2, -15 and -1 in Python's `subprocess`).
+Exit codes: 0 success, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
+143 and 129 in a shell: stopped by SIGINT, SIGTERM or SIGHUP. If there is something to save, it is
+saved first. If not, the signal itself ends the process at once; Python's `subprocess` reports this
+as -2, -15 and -1.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from sqn_jax.runs.signals import Interrupted, end_at_once
 USAGE = """usage: sqn COMMAND [OPTIONS]
 
   sqn train              train a robot, evaluate it, and draw what it did
-  sqn evaluate RUN ...   compare trained robots on any maps, with noise, beside references
-  sqn report RUN ...     the same as a page with pictures, what went worst first
-  sqn render RUN ...     films and pictures of what trained robots do on a map
-  sqn map check FILE     say what a map offers, or what is wrong with it
+  sqn evaluate RUN ...   compare trained robots and baselines on any maps, with noise
+  sqn report RUN ...     the same as a page with pictures, the worst episodes first
+  sqn render RUN ...     animations and pictures of what trained robots do on a map
+  sqn map check FILE     describe a map, or say what is wrong with it
 
 `sqn COMMAND --help` lists the options of a command.
 """
@@ -42,17 +42,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Interrupted as stop:
         print(f"\nsqn: {stop}", file=sys.stderr)
         code = stop.exit_code
-    except BrokenPipeError:  # Whoever read along, say `head`, has enough.
+    except BrokenPipeError:  # The reader, say `head`, has closed the pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     return code
 
 
 def run() -> NoReturn:
-    """The process `sqn`: end with the exit code of `main`.
+    """Run `main` and end the process with its exit code.
 
-    After a signal or a failure at once: threads of XLA or Orbax may still be at work, and would
-    crash or complain while Python is taken down.
+    After a signal or a failure the process ends at once: threads of XLA or Orbax may still be
+    running, and would crash or print errors while Python shuts down.
     """
     end_at_once()
     code = main()
@@ -67,27 +67,27 @@ def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE, end="")
         return 0 if arguments else 2
-    name, *of_command = arguments
+    name, *command_arguments = arguments
     command = _COMMANDS.get(name)
     if command is None:
         return _refuse(f"unknown command {name!r}, expected one of {', '.join(_COMMANDS)}")
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
-            return command(of_command)
+            return command(command_arguments)
     except SystemExit as stop:  # After a help text.
         return int(stop.code or 0)
     except BrokenPipeError:
         raise
     except OSError as error:  # A full disk, say.
-        named = error.filename and error.strerror
-        return _fail(f"{error.filename}: {error.strerror}" if named else str(error))
+        has_file = error.filename and error.strerror
+        return _fail(f"{error.filename}: {error.strerror}" if has_file else str(error))
     except ValueError as error:
         code = _refuse(str(error))
         if table := getattr(error, "table", ""):
             print(table, file=sys.stderr)
         return code
-    except FloatingPointError as error:  # Learning has diverged.
+    except FloatingPointError as error:  # The run has diverged.
         return _fail(str(error))
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: their parser, options that several have, checks of arguments."""
+"""The parser of the commands, options that several of them have, and types of arguments."""
 
 from __future__ import annotations
 
@@ -15,26 +15,28 @@ TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
 }
 
 CACHE = (
-    "Compiled programs are kept in the user's cache folder for the next start: SQN_JAX_CACHE=DIR "
-    "in the environment names another folder, SQN_JAX_CACHE=off keeps none."
+    "Compiled programs are stored in the user's cache folder for the next start. The environment "
+    "variable SQN_JAX_CACHE=DIR selects another folder; SQN_JAX_CACHE=off stores none."
 )
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports what is wrong as a ValueError, without the usage text."""
+    """Reports errors as a ValueError, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise what argparse would print."""
+        """Raise the message that argparse would print."""
         raise ValueError(message)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
-    """The option --device."""
-    parser.add_argument("--device", choices=["cpu", "gpu", "tpu"], help="default: what there is")
+    """Add the option --device."""
+    parser.add_argument(
+        "--device", choices=["cpu", "gpu", "tpu"], help="default: the fastest there is"
+    )
 
 
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
-    """The option --checkpoint."""
+    """Add the option --checkpoint."""
     parser.add_argument(
         "--checkpoint",
         type=checkpoint,
@@ -45,7 +47,7 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
 
 
 def checkpoint(argument: str) -> int | str:
-    """Which checkpoint of a run."""
+    """A checkpoint of a run: newest, best, or its number of chunks."""
     if argument in ("newest", "best"):
         return argument
     if argument.isascii() and argument.isdigit():
@@ -54,12 +56,12 @@ def checkpoint(argument: str) -> int | str:
 
 
 def folder(argument: str) -> Path:
-    """The name of a folder."""
+    """The path of a folder."""
     if not argument.strip():
         raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
     return Path(argument)
 
 
 def single_maps(arguments: Sequence[str]) -> tuple[str, ...]:
-    """The names of the maps that arguments stand for, one by one."""
+    """The name of each single map that the arguments stand for."""
     return tuple(str(name) for argument in arguments for name in parse(argument).names)

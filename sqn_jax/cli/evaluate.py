@@ -16,10 +16,10 @@ from sqn_jax.config.presets import PAPER_MAPS
 
 
 def evaluate(arguments: list[str]) -> int:
-    """Compare policies."""
+    """Evaluate policies and baselines, and print a table."""
     parser = Parser(
         prog="sqn evaluate",
-        description="Drive greedy episodes of trained policies; every agent gets the same tasks.",
+        description="Run greedy episodes of trained policies; all agents get the same tasks.",
         epilog=CACHE,
         allow_abbrev=False,
     )
@@ -28,27 +28,33 @@ def evaluate(arguments: list[str]) -> int:
         "runs",
         nargs="*",
         metavar="RUN",
-        help="run folders, pretrained:NAME or files NAME.npz; none: references",
+        help="run folders, pretrained:NAME or files NAME.npz; default: only the baselines",
     )
     add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
-    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
-    add("--eval-seeds", type=int, default=5, help="how many evaluation seeds (default 5)")
-    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--episodes", type=int, default=100, help="per evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=5, help="number of evaluation seeds (default 5)")
+    add("--seed", type=int, default=1_000, help="the first evaluation seed (default 1000)")
     add("--velocity-noise", nargs="+", type=float, default=[], metavar="S", help="e.g. 0.1 0.2")
     add("--range-noise", nargs="+", type=float, default=[], metavar="P", help="e.g. 0.2 0.4")
     add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
-    add("--max-steps", type=int, default=0, help="steps an episode (default: as each map says)")
+    add(
+        "--max-steps",
+        type=int,
+        default=0,
+        help="steps per episode (default: each map's limit)",
+    )
     add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
     add_device(parser)
-    add("--out", type=Path, help="JSON file; one record an episode goes beside it as .jsonl")
+    add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")
     options = parser.parse_args(arguments)
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
-    from sqn_jax.evaluation import compare
+    from sqn_jax.evaluation.agents import group_policies, with_baselines
     from sqn_jax.evaluation.scores import results_table
+    from sqn_jax.evaluation.settings import Settings
     from sqn_jax.policies.pretrained import find_policy
     from sqn_jax.runs.evaluate import evaluate_session
     from sqn_jax.training import devices
@@ -56,7 +62,7 @@ def evaluate(arguments: list[str]) -> int:
     devices.require(options.device)
     noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
     noise += [(0.0, level) for level in options.range_noise if level != 0]
-    settings = compare.Settings(
+    settings = Settings(
         maps=single_maps(options.maps),
         tasks=tuple(TASKS[name] for name in options.tasks),
         episodes=options.episodes,
@@ -69,17 +75,15 @@ def evaluate(arguments: list[str]) -> int:
     )
     if options.out is not None:
         _require_writable(options.out)
-    learnt = compare.group_policies(
-        [find_policy(name, options.checkpoint) for name in options.runs]
-    )
-    agents = compare.with_references(learnt, references=not options.no_references)
+    trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
+    agents = with_baselines(trained, baselines=not options.no_references)
     evaluation = evaluate_session(agents, settings, options.out)
     print(results_table(evaluation["results"]))
-    for told in evaluation["comparisons"]:
-        low, high = told["ci95"]
+    for comparison in evaluation["comparisons"]:
+        low, high = comparison["ci95"]
         print(
-            f"{told['first']} beats {told['second']} with probability "
-            f"{told['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
+            f"{comparison['first']} beats {comparison['second']} with probability "
+            f"{comparison['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
         )
     if options.out is not None:
         print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")

@@ -7,8 +7,8 @@ from sqn_jax.config.map_names import parse
 
 
 def check_map(arguments: list[str]) -> int:
-    """Say what a map offers."""
-    parser = Parser(prog="sqn map", description="Look at maps.", allow_abbrev=False)
+    """Describe a map."""
+    parser = Parser(prog="sqn map", description="Check maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
     parser.add_argument("file", help="a file, a map of the project by name, or maze:7, maze:0-3")
     parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
@@ -21,9 +21,9 @@ def check_map(arguments: list[str]) -> int:
     from sqn_jax.maps import load_map
     from sqn_jax.maps.check import describe
 
-    for number, name in enumerate(parse(options.file).names):
+    for index, name in enumerate(parse(options.file).names):
         occupancy_map = load_map(
             name, robot_radius=options.robot_radius, allow_outside=options.allow_outside
         )
-        print("\n" * (number > 0) + describe(occupancy_map, options.robot_radius))
+        print("\n" * (index > 0) + describe(occupancy_map, options.robot_radius))
     return 0

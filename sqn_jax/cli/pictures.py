@@ -16,11 +16,11 @@ from sqn_jax.cli.arguments import (
 
 
 def report(arguments: list[str]) -> int:
-    """Write a page."""
+    """Write a report."""
     parser = Parser(
         prog="sqn report",
-        description="Drive greedy episodes of trained policies and write one page about them: "
-        "what went worst, success and time steps, curves, paths, an animation, settings.",
+        description="Run greedy episodes of trained policies and write one page about them: "
+        "the worst episodes, success and time steps, curves, paths, an animation, settings.",
         epilog=CACHE,
         allow_abbrev=False,
     )
@@ -28,9 +28,9 @@ def report(arguments: list[str]) -> int:
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--maps", nargs="+", help="names or files (default: the map of the first run)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
-    add("--episodes", type=int, default=100, help="under each evaluation seed (default 100)")
-    add("--eval-seeds", type=int, default=1, help="how many evaluation seeds (default 1)")
-    add("--seed", type=int, default=1_000, help="the first of them (default 1000)")
+    add("--episodes", type=int, default=100, help="per evaluation seed (default 100)")
+    add("--eval-seeds", type=int, default=1, help="number of evaluation seeds (default 1)")
+    add("--seed", type=int, default=1_000, help="the first evaluation seed (default 1000)")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
     add_device(parser)
@@ -39,17 +39,17 @@ def report(arguments: list[str]) -> int:
     if not options.runs:
         raise ValueError("nothing to report on: name a run folder or pretrained:NAME")
     try:
-        from sqn_jax import report as pages
+        from sqn_jax import report as reports
     except ModuleNotFoundError as error:
         if error.name != "matplotlib":
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
-    from sqn_jax.evaluation.compare import Settings
+    from sqn_jax.evaluation.settings import Settings
     from sqn_jax.training import devices
 
     devices.require(options.device)
-    pages.require_writable(options.out)
-    runs = pages.read_runs(options.runs, options.checkpoint)
+    reports.require_writable(options.out)
+    runs = reports.read_runs(options.runs, options.checkpoint)
     config = runs[0].policy.config
     maps = options.maps or [str(config.maps.names[0])]
     settings = Settings(
@@ -60,34 +60,34 @@ def report(arguments: list[str]) -> int:
         seed=options.seed,
         goal_radii=(config.env.goal_radius,),
     )
-    pages.write_report(runs, settings, options.out, references=not options.no_references)
+    reports.write_report(runs, settings, options.out, baselines=not options.no_references)
     print(f"wrote {options.out}")
     return 0
 
 
 def render(arguments: list[str]) -> int:
-    """Write pictures and films."""
+    """Write pictures and animations."""
     parser = Parser(
         prog="sqn render",
-        description="Drive greedy episodes of trained policies on a map and write what they did: "
-        "films (GIF), the paths of all side by side and timelines.",
+        description="Run greedy episodes of trained policies on a map and draw them: animations "
+        "(GIF), the paths of all policies side by side, and timelines.",
         epilog=CACHE,
         allow_abbrev=False,
     )
     add = parser.add_argument
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--map", default="maze", help="a name or a file (default maze)")
-    add("--episodes", type=int, default=4, help="of each policy (default 4)")
+    add("--episodes", type=int, default=4, help="per policy (default 4)")
     add("--tasks", choices=list(TASKS), default="points", help="default: points")
-    add("--animations", type=int, default=1, help="films of each policy (default 1)")
+    add("--animations", type=int, default=1, help="animations per policy (default 1)")
     add("--seed", type=int, default=1_000, help="the evaluation seed (default 1000)")
     add("--velocity-noise", type=float, default=0.0, metavar="S", help="e.g. 0.1")
     add("--range-noise", type=float, default=0.0, metavar="P", help="e.g. 0.2")
-    add("--max-steps", type=int, default=0, help="steps an episode (default: as the map says)")
-    add("--mp4", action="store_true", help="write films as MP4, too; needs sqn_jax[video]")
+    add("--max-steps", type=int, default=0, help="steps per episode (default: the map's limit)")
+    add("--mp4", action="store_true", help="also write MP4 files; needs sqn_jax[video]")
     add_checkpoint(parser)
     add_device(parser)
-    add("--out", type=folder, metavar="DIR", help="default: renders/NAME_MAP, NAME the run's")
+    add("--out", type=folder, metavar="DIR", help="default: renders/RUN_MAP")
     options = parser.parse_args(arguments)
     if not options.runs:
         raise ValueError("nothing to render: name a run folder or pretrained:NAME")
@@ -95,7 +95,7 @@ def render(arguments: list[str]) -> int:
     from sqn_jax.training import devices
 
     try:
-        from sqn_jax.report import render as pictures
+        from sqn_jax.report import render as renders
     except ModuleNotFoundError as error:
         if not (error.name or "").startswith("matplotlib"):
             raise
@@ -105,9 +105,9 @@ def render(arguments: list[str]) -> int:
         if options.runs.count(name) > 1:
             raise ValueError(f"{name}: comes twice, expected each run once")
     policies = [find_policy(name, options.checkpoint) for name in options.runs]
-    pictures.render_session(
+    renders.render_session(
         policies,
-        options.out or pictures.default_folder(policies, options.map),
+        options.out or renders.default_folder(policies, options.map),
         map_name=options.map,
         tasks=TASKS[options.tasks],
         episodes=options.episodes,

@@ -1,4 +1,4 @@
-"""The settings of a run as options: one for each field of `TrainConfig` and of its groups."""
+"""The settings of a run as options: one for each field of `TrainConfig` and its groups."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ METAVARS = {int: "INT", float: "FLOAT", str: "TEXT"}
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add `--field VALUE` and `--group.field VALUE`, described by the docstrings of the fields.
 
-    The namespace has a setting under the dotted name of its field, None where it is not given.
+    In the namespace a setting has the dotted name of its field; it is None if not given.
     """
     hints = typing.get_type_hints(TrainConfig)
     groups: dict[str, Any] = {
@@ -35,7 +35,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def option(dotted: str, value: object = None) -> str:
-    """How a setting is spelled as an option, a switch that is to be off with `no-`."""
+    """The option for a setting; a switch that is off is spelled with `no-`."""
     group, dot, name = dotted.replace("_", "-").rpartition(".")
     return f"--{group}{dot}{'no-' if value is False else ''}{name}"
 
@@ -66,20 +66,20 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
 
 
 def normalized(arguments: Sequence[str]) -> list[str]:
-    """Options with dashes for underscores, and negative numbers tied to the option before them.
+    """Arguments with dashes for underscores in options, and `=` before negative numbers.
 
     argparse would list both spellings, and takes `-1e-3` for an option.
     """
-    tied: list[str] = []
+    result: list[str] = []
     for argument in arguments:
         if argument.startswith("--"):
             name, equals, value = argument.partition("=")
-            tied.append(name.replace("_", "-") + equals + value)
-        elif tied and tied[-1].startswith("--") and "=" not in tied[-1] and _is_negative(argument):
-            tied[-1] += f"={argument}"
+            result.append(name.replace("_", "-") + equals + value)
+        elif _is_negative(argument) and result and _expects_value(result[-1]):
+            result[-1] += f"={argument}"
         else:
-            tied.append(argument)
-    return tied
+            result.append(argument)
+    return result
 
 
 def _is_negative(argument: str) -> bool:
@@ -88,6 +88,10 @@ def _is_negative(argument: str) -> bool:
     except ValueError:
         return False
     return argument.startswith("-")
+
+
+def _expects_value(argument: str) -> bool:
+    return argument.startswith("--") and "=" not in argument
 
 
 class _Switch(argparse.Action):
@@ -111,14 +115,14 @@ def _add_fields(
     for name, hint in typing.get_type_hints(cls).items():
         if name in leave_out:
             continue
-        options, shown = [option(f"{prefix}{name}")], "%(default)s"
-        how: dict[str, Any] = {"type": hint, "metavar": METAVARS.get(hint)}
+        options, default = [option(f"{prefix}{name}")], "%(default)s"
+        keywords: dict[str, Any] = {"type": hint, "metavar": METAVARS.get(hint)}
         if hint is bool:
             options.append(option(f"{prefix}{name}", False))
-            how = {"action": _Switch, "nargs": 0}
+            keywords = {"action": _Switch, "nargs": 0}
         elif typing.get_origin(hint) is Literal:
-            how = {"choices": typing.get_args(hint)}
+            keywords = {"choices": typing.get_args(hint)}
         elif hint is str:
-            shown = "%(default)r"
+            default = "%(default)r"
         text = " ".join(descriptions[name].split()).replace("%", "%%")
-        add(*options, dest=f"{prefix}{name}", help=f"{text} (default: {shown})", **how)
+        add(*options, dest=f"{prefix}{name}", help=f"{text} (default: {default})", **keywords)

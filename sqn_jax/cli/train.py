@@ -20,27 +20,29 @@ from sqn_jax.config.presets import PRESETS
 
 
 def train(arguments: list[str]) -> int:
-    """Start a run, or go on with one."""
+    """Start a run, or resume one."""
     parser = _parser()
-    given, unknown = parser.parse_known_args(normalized(arguments))
+    options, unknown = parser.parse_known_args(normalized(arguments))
     settings = {
         name: value
-        for name, value in vars(given).items()
+        for name, value in vars(options).items()
         if name in _SETTINGS and value is not None
     }
-    preset = given.preset or "quick"
-    if given.help:
+    preset = options.preset or "quick"
+    if options.help:
         parser.set_defaults(**configs.flat(configs.to_dict(PRESETS[preset])))
         parser.print_help()
         return 0
-    if given.resume:
-        config = _resumed_config(given, settings, unknown)
-        return _run_training(config, given.run_dir, given)
+    if options.resume:
+        config = _resumed_config(options, settings, unknown)
+        return _run_training(config, options.run_dir, options)
     if unknown:
-        raise ValueError(f"unrecognized arguments: {' '.join(unknown)}{_nearest(unknown, given)}")
+        raise ValueError(
+            f"unrecognized arguments: {' '.join(unknown)}{_suggestion(unknown, options)}"
+        )
     config = with_settings(PRESETS[preset], settings)
-    run_dir = given.run_dir or _default_run_dir(config, preset)
-    return _run_training(config, run_dir, given)
+    run_dir = options.run_dir or _default_run_dir(config, preset)
+    return _run_training(config, run_dir, options)
 
 
 _SETTINGS = frozenset(configs.flat(configs.to_dict(TrainConfig())))
@@ -59,19 +61,19 @@ def _parser() -> Parser:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    # Not argparse's own: the defaults shown are those of the preset, which may be named after it.
+    # Not that of argparse: it shows the defaults of the preset, which may be given after it.
     add("-h", "--help", action="store_true", help="show this and exit")
     add(
         "--preset",
         choices=list(PRESETS),
-        help="where settings that are not given come from; their defaults below are those of the "
-        "preset named beside --help (default: quick)",
+        help="the defaults of settings that are not given; --help shows those of the preset given "
+        "with it (default: quick)",
     )
-    add("--run-dir", type=folder, metavar="DIR", help="where to write (default: runs/NAME)")
+    add("--run-dir", type=folder, metavar="DIR", help="the run folder (default: runs/NAME)")
     add(
         "--resume",
         action="store_true",
-        help="go on with the run in --run-dir; takes no setting but --total-episodes",
+        help="resume the run in --run-dir; the only setting allowed is --total-episodes",
     )
     add_device(parser)
     add(
@@ -79,44 +81,45 @@ def _parser() -> Parser:
         type=int,
         metavar="N",
         help="divide the robots between N cores of the CPU or N accelerators (default: as many "
-        "cores as help, or one accelerator)",
+        "cores as speed it up, or one accelerator)",
     )
     add(
         "--tensorboard",
         action="store_true",
-        help="write for TensorBoard into the run folder, too",
+        help="also write for TensorBoard into the run folder",
     )
     add_settings(parser)
     return parser
 
 
 def _formatter(prog: str) -> argparse.HelpFormatter:
-    """Options and their descriptions side by side where the terminal is wide enough for that."""
+    """Options and descriptions side by side if the terminal is wide enough."""
     width = min(shutil.get_terminal_size().columns, 120) - 2
     return argparse.HelpFormatter(prog, max_help_position=40 if width > 100 else 8, width=width)
 
 
-def _nearest(unknown: list[str], given: argparse.Namespace) -> str:
-    """A proposal for an option that is misspelled, if one is near."""
-    name = next((each for each in unknown if each.startswith("-")), "").partition("=")[0]
-    options = [option(dotted) for dotted in vars(given)]
-    near = [each for each in options if each.endswith(f".{name.lstrip('-')}")]
-    near = near or difflib.get_close_matches(name, options, n=1)
-    return f" (did you mean {near[0]}?)" if near else ""
+def _suggestion(unknown: list[str], options: argparse.Namespace) -> str:
+    """A suggestion for a misspelled option, if a similar one exists."""
+    name = next((argument for argument in unknown if argument.startswith("-")), "")
+    name = name.partition("=")[0]
+    known = [option(dotted) for dotted in vars(options)]
+    similar = [spelling for spelling in known if spelling.endswith(f".{name.lstrip('-')}")]
+    similar = similar or difflib.get_close_matches(name, known, n=1)
+    return f" (did you mean {similar[0]}?)" if similar else ""
 
 
 def _resumed_config(
-    given: argparse.Namespace, settings: dict[str, Any], unknown: list[str]
+    options: argparse.Namespace, settings: dict[str, Any], unknown: list[str]
 ) -> TrainConfig:
-    """The settings in a run folder, perhaps with another number of episodes."""
-    if given.run_dir is None:
-        raise ValueError("--resume needs --run-dir, the folder of the run to go on with")
+    """The settings in a run folder, maybe with another number of episodes."""
+    if options.run_dir is None:
+        raise ValueError("--resume needs --run-dir, the folder of the run to resume")
     excess = [
         option(name, value) + ("" if isinstance(value, bool) else f" {value}")
         for name, value in settings.items()
         if name != "total_episodes"
     ]
-    excess += ([f"--preset {given.preset}"] if given.preset else []) + unknown
+    excess += ([f"--preset {options.preset}"] if options.preset else []) + unknown
     if excess:
         raise ValueError(
             "--resume takes every setting from the run folder, expected no option but --run-dir, "
@@ -125,7 +128,7 @@ def _resumed_config(
         )
     from sqn_jax.storage.run_folder import RunFolder
 
-    _, config = RunFolder.open(given.run_dir)
+    _, config = RunFolder.open(options.run_dir)
     return with_settings(config, settings)
 
 
@@ -135,30 +138,33 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
     return Path("runs") / f"{stamp}_{config.algo}_{name}_{preset}"
 
 
-def _run_training(config: TrainConfig, run_dir: Path, given: argparse.Namespace) -> int:
+def _run_training(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> int:
     from sqn_jax.runs.train import train_session
     from sqn_jax.training import devices
 
     devices.use_cores()
-    devices.require(given.device)
+    devices.require(options.device)
     config = _with_absolute_paths(config)
     command = f"sqn train --run-dir {shlex.quote(str(run_dir))} --resume"
-    for name in ("device", "num_devices"):  # On others it would not be the same to the bit.
-        value = getattr(given, name)
+    for name in (
+        "device",
+        "num_devices",
+    ):  # With others the results would differ.
+        value = getattr(options, name)
         command += "" if value is None else f" --{name.replace('_', '-')} {value}"
     train_session(
         config,
         run_dir,
-        resume=given.resume,
-        num_devices=given.num_devices,
-        tensorboard=given.tensorboard,
-        go_on=f"`{command}`",
+        resume=options.resume,
+        num_devices=options.num_devices,
+        tensorboard=options.tensorboard,
+        resume_command=f"`{command}`",
     )
     return 0
 
 
 def _with_absolute_paths(config: TrainConfig) -> TrainConfig:
-    """Files and folders stay findable when the run is resumed from another folder."""
+    """Absolute paths, so that the run can be resumed from another folder."""
     from sqn_jax.policies.pretrained import PREFIX
 
     start = config.start_from

@@ -1,4 +1,4 @@
-"""Who is evaluated, and what comes of it: policies and baselines, and a batch of their episodes."""
+"""The agents of an evaluation, trained policies and baselines, and batches of their episodes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OnBatch = Callable[[int], object]
 
 
 class Agent(Protocol):
-    """Whoever acts."""
+    """Anything that can be evaluated: it chooses the actions of a robot."""
 
     @property
     def name(self) -> str: ...
@@ -37,7 +37,7 @@ class Agent(Protocol):
 
     @property
     def training_seeds(self) -> Sequence[int | None]:
-        """One None for an agent that was not trained."""
+        """Seeds of the training runs; a single None for an agent that was not trained."""
 
     def run(
         self,
@@ -48,24 +48,24 @@ class Agent(Protocol):
         fields: Sequence[str],
         on_batch: OnBatch,
     ) -> tuple[list[EpisodeMetrics], Trajectory]:
-        """The episodes of an evaluation seed.
+        """Run the episodes of an evaluation seed.
 
         Args:
-            eval_seed: lays down tasks and noise.
-            training_seed: whose policy acts.
-            world: where.
-            settings: how many episodes, and the goal radii.
-            fields: what of the trajectory is wanted.
-            on_batch: called as the episodes are run.
+            eval_seed: determines tasks and noise.
+            training_seed: selects the policy.
+            world: the world to run in.
+            settings: the number of episodes E and the goal radii.
+            fields: the fields of `Trajectory` to return.
+            on_batch: called after each batch of episodes.
 
         Returns:
-            For each goal radius one number an episode [E], and these fields of all steps.
+            The metrics for each goal radius, [E] each, and the trajectory with these fields.
         """
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """Policies of one agent: runs that differ in nothing but their seeds."""
+class TrainedAgent:
+    """Policies of one agent: runs that differ only in their seeds."""
 
     name: str
     policies: tuple[Policy, ...]
@@ -87,9 +87,9 @@ class Learnt:
         return [seed for policy in self.policies for seed in policy.training_seeds]
 
     def params(self, training_seed: int | None) -> Params:
-        """The parameters that the run with this seed came to."""
-        every = [params for policy in self.policies for params in policy.params]
-        return every[self.training_seeds.index(training_seed)]
+        """The trained parameters of this seed."""
+        params_of_seeds = [params for policy in self.policies for params in policy.params]
+        return params_of_seeds[self.training_seeds.index(training_seed)]
 
     def run(
         self,
@@ -112,8 +112,8 @@ class Learnt:
 
 
 @dataclass(frozen=True)
-class Reference:
-    """A baseline, which was not trained: `oracle` knows the map, `bug` sees what agents see."""
+class BaselineAgent:
+    """An agent that was not trained: `oracle` knows the map, `bug` sees what agents see."""
 
     name: Literal["oracle", "bug"]
     env_config: EnvConfig
@@ -159,23 +159,23 @@ class EpisodeBatch:
     """None for a baseline, which was not trained."""
     eval_seed: int
     metrics: Mapping[float, EpisodeMetrics]
-    """By the goal radius, m, in the order of the settings; NumPy arrays [E]."""
+    """By goal radius, m, in the order of the settings; NumPy arrays [E]."""
     starts: NDArray[np.floating]
     """[E, 3] x m, y m, heading rad."""
     goals: NDArray[np.floating]
     """[E, 2] x m, y m."""
     shortest_paths: NDArray[np.floating] | None = None
-    """[E] m, from start to goal; None where they were not worked out."""
+    """[E] m, from start to goal; None where they were not computed."""
     trajectory: Trajectory = field(default_factory=Trajectory)
-    """Of all steps what was asked for, NumPy arrays; nothing in the results of an evaluation."""
+    """The requested fields of all steps, NumPy arrays; empty in the results of an evaluation."""
 
     @property
     def main_metrics(self) -> EpisodeMetrics:
-        """Those for the first goal radius."""
+        """The metrics for the first goal radius."""
         return next(iter(self.metrics.values()))
 
     def numbers(self, goal_radius: float) -> dict[str, NDArray[np.float64]]:
-        """Every number of an episode by the name it has in the files, [E] each."""
+        """The numbers of each episode, [E] each, by the names that they have in the files."""
         metrics = self.metrics[goal_radius]
         named: dict[str, ArrayLike] = {
             "success": metrics.success,
@@ -192,15 +192,15 @@ class EpisodeBatch:
         return {name: np.asarray(values, np.float64) for name, values in named.items()}
 
 
-def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
-    """Pool the runs that differ in nothing but their seeds; each pool is one agent.
+def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
+    """Pool the runs that differ only in their seeds; each pool is one agent.
 
     Raises:
-        ValueError: a training seed comes twice in a pool.
+        ValueError: a training seed occurs twice in a pool.
     """
     pools: dict[TrainConfig, list[Policy]] = {}
     for policy in policies:
-        same = dataclasses.replace(
+        without_seed = dataclasses.replace(
             policy.config,
             seed=0,
             num_seeds=1,
@@ -208,12 +208,13 @@ def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
             checkpoint_replay=True,
             max_skipped_updates=0,
         )
-        pools.setdefault(same, []).append(policy)
+        pools.setdefault(without_seed, []).append(policy)
     algorithms = [config.algo for config in pools]
     agents = []
     for config, pool in pools.items():
-        alone = algorithms.count(config.algo) == 1
-        agent = Learnt(config.algo if alone else f"{config.algo} {pool[0].name}", tuple(pool))
+        is_only_one = algorithms.count(config.algo) == 1
+        name = config.algo if is_only_one else f"{config.algo} {pool[0].name}"
+        agent = TrainedAgent(name, tuple(pool))
         seeds = list(agent.training_seeds)
         if len(set(seeds)) < len(seeds):
             folders = ", ".join(policy.name for policy in pool)
@@ -222,9 +223,9 @@ def group_policies(policies: Sequence[Policy]) -> list[Learnt]:
     return agents
 
 
-def with_references(agents: Sequence[Agent], *, references: bool) -> list[Agent]:
-    """The agents, and after them the navigators that were not trained, with the first's robot."""
-    if not references:
+def with_baselines(agents: Sequence[Agent], *, baselines: bool) -> list[Agent]:
+    """The agents, followed by the baselines, which get the robot of the first agent."""
+    if not baselines:
         return list(agents)
     robot = agents[0].env_config if agents else EnvConfig()
-    return [*agents, Reference("bug", robot), Reference("oracle", robot)]
+    return [*agents, BaselineAgent("bug", robot), BaselineAgent("oracle", robot)]

@@ -1,8 +1,7 @@
-"""Episodes of baselines, which are no networks: the oracle and the wall follower.
+"""Episodes of the baselines: the oracle and the wall follower.
 
-They choose their actions on the host. Starts, goals and noise are those that
-`episodes.run_episodes` gives to a network for the same keys, a step is that of the rollout, and
-what is recorded is the same `Trajectory`.
+They choose their actions on the host. For the same keys, starts, goals and noise are the same as in
+`episodes.run_episodes`. The step is that of the rollout, and the result is the same `Trajectory`.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from sqn_jax.training.rollout import EpisodeMetrics, with_ends
 
 Ints = NDArray[np.int64]
 Choose = Callable[[Observation, EnvState], Ints]
-"""Actions [E] from the observations and states of all robots; called once a step."""
+"""Actions [E] from the observations and env states of all robots; called once per step."""
 
 
 def oracle(occupancy_map: OccupancyMap, env_params: EnvParams) -> Choose:
-    """The choice of a navigator that knows the map, for the episodes of one run.
+    """A navigator that knows the map, for the episodes of one run.
 
     Args:
-        occupancy_map: the map `env_params` was made from.
+        occupancy_map: the map that `env_params` was made from.
         env_params: the world.
 
     Returns:
-        The choice; it raises ValueError if the map is not the one of `env_params`, or the robot
-        cannot drive or turn.
+        A function that raises ValueError if the map is not that of `env_params`, or the robot
+        cannot move or turn.
     """
     navigator: Oracle | None = None
 
@@ -54,7 +53,7 @@ def oracle(occupancy_map: OccupancyMap, env_params: EnvParams) -> Choose:
 
 
 def bug(env_params: EnvParams, num_episodes: int) -> Choose:
-    """The choice of the wall follower, which sees the observation and nothing else."""
+    """The wall follower, which sees only the observation."""
     navigator = BugNavigator(env_params.config, num_episodes)
 
     def choose(obs: Observation, _: EnvState) -> Ints:
@@ -75,24 +74,24 @@ def run_baseline(
     """Run whole episodes with actions chosen on the host.
 
     Args:
-        keys: [E] from `episodes.episode_keys`: the same ones give the same tasks and noise.
-        choose: who acts; a fresh one for each run.
+        keys: [E] from `episodes.episode_keys`; the same keys give the same tasks and noise.
+        choose: chooses the actions; a new function for each run.
         env_params: the world.
-        goal_radii: m, what counts as reaching the goal; by default only `env_params.goal_radius`.
-        fields: of `Trajectory`, those to return.
+        goal_radii: m, within which the goal is reached; default: `env_params.goal_radius` only.
+        fields: the fields of `Trajectory` to return.
 
     Returns:
-        For each radius one number an episode [E], and the fields of all episodes; NumPy arrays.
-        In `output` a single skill of weight 1 says nothing, nor do its values.
+        The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
+        `output` is a placeholder: one skill of weight 1 whose action values are 0.
     """
     step_keys, first = start_by_hand(keys, env_params)
-    # Observations of many episodes take much memory, and are mostly not wanted.
-    wanted = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
+    # Observations of many episodes take much memory and are rarely needed.
+    needed = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
     actors, steps = first, []
     for keys_of_step in step_keys:
         actions = jnp.asarray(choose(actors.obs, actors.env_state), jnp.int32)
         actors, step = step_by_hand(keys_of_step, actors, actions, env_params)
-        steps.append(jax.device_get(step.only(*wanted)))
+        steps.append(jax.device_get(step.only(*needed)))
     stacked = jax.tree.map(lambda *parts: np.stack(parts), *steps)
     trajectory = with_ends(stacked, first, actors)
     trajectory = dataclasses.replace(trajectory, output=_one_skill(stacked))

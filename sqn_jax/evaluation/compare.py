@@ -1,7 +1,7 @@
 """Agents side by side: the same starts, goals and noise for each, on any maps.
 
-`evaluate_agents` runs policies and baselines over maps and noise levels and returns what the
-evaluation file holds. What is said on screen is up to the caller.
+`evaluate_agents` runs policies and baselines on maps under noise and returns the contents of the
+evaluation file. It prints nothing.
 """
 
 from __future__ import annotations
@@ -16,47 +16,23 @@ from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.evaluation import scores
-from sqn_jax.evaluation.agents import (
-    Agent,
-    EpisodeBatch,
-    Learnt,
-    OnBatch,
-    Reference,
-    group_policies,
-    with_references,
-)
-from sqn_jax.evaluation.settings import Maps, Settings, Tasks, World, robot_for, worlds
+from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch
+from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import load_map
 
-__all__ = [
-    "Agent",
-    "EpisodeBatch",
-    "Learnt",
-    "Maps",
-    "OnEvaluated",
-    "Reference",
-    "Settings",
-    "Tasks",
-    "World",
-    "evaluate_agents",
-    "group_policies",
-    "load_maps",
-    "num_episodes",
-    "with_references",
-]
-
 OnEvaluated = Callable[[EpisodeBatch], object]
+"""Called with the episodes of a training seed in a world under an evaluation seed."""
 
 
 def num_episodes(agents: Sequence[Agent], settings: Settings) -> int:
     """Episodes that `evaluate_agents` will run."""
-    worlds = len(settings.maps) * len(settings.tasks) * len(settings.noise)
-    policies = sum(len(agent.training_seeds) for agent in agents)
-    return worlds * policies * settings.eval_seeds * settings.episodes
+    num_worlds = len(settings.maps) * len(settings.tasks) * len(settings.noise)
+    num_policies = sum(len(agent.training_seeds) for agent in agents)
+    return num_worlds * num_policies * settings.eval_seeds * settings.episodes
 
 
 def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
-    """The maps of an evaluation, for every robot that is to act on them.
+    """Load the maps of an evaluation, for the robot of every agent.
 
     Raises:
         ValueError: a map is unusable for a robot.
@@ -67,13 +43,13 @@ def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
         for name in settings.maps
         for radius in radii
     }
-    called: dict[str, str] = {}
+    setting_of: dict[str, str] = {}
     for (name, _), occupancy_map in maps.items():
         if occupancy_map.tiles != (1, 1):
             raise ValueError(f"map {name}: several, expected one for an evaluation")
-        if called.setdefault(occupancy_map.name, name) != name:
+        if setting_of.setdefault(occupancy_map.name, name) != name:
             raise ValueError(
-                f"maps {called[occupancy_map.name]} and {name}: both are called "
+                f"maps {setting_of[occupancy_map.name]} and {name}: both are called "
                 f"{occupancy_map.name!r}, the results could not be told apart"
             )
     return maps
@@ -90,18 +66,18 @@ def evaluate_agents(
     """Run every agent in every world.
 
     Args:
-        agents: who acts; names must differ.
+        agents: the agents; their names must differ.
         maps: from `load_maps`.
-        settings: where, how often and under what noise.
+        settings: maps, tasks, noise, seeds and goal radii.
         on_batch: called with the number of episodes that have just been run.
         on_evaluated: called with the episodes of each training seed in each world under each
-            evaluation seed, for those who want more than numbers.
-        fields: of `Trajectory`, what of all steps `on_evaluated` is to get beside poses and goals.
+            evaluation seed.
+        fields: the fields of `Trajectory` that `on_evaluated` gets, beside poses and goals.
 
     Returns:
-        The evaluation file (`schema`, `std_ddof`, `results`, `comparisons`), and one record an
-        episode. `std_ddof` is 1: standard deviations are those of the sample (`scores.describe`).
-        Files without it hold the population's.
+        The contents of the evaluation file (`schema`, `std_ddof`, `results`, `comparisons`), and a
+        record of each episode. `std_ddof` is 1: sample standard deviations (`scores.describe`). In
+        files without it they are those of the population.
     """
     results: list[dict[str, Any]] = []
     records: list[dict[str, Any]] = []
@@ -116,9 +92,9 @@ def evaluate_agents(
             for agent in actors:
                 for batch in _batches(agent, world, settings, paths, on_batch, fields):
                     on_evaluated(batch)
-                    # Statistics of many episodes must not hold all of their steps.
-                    bare = dataclasses.replace(batch, trajectory=batch.trajectory.only())
-                    evaluated[agent.name].append(bare)
+                    # The steps of many episodes would fill the memory; statistics need none.
+                    without_steps = dataclasses.replace(batch, trajectory=batch.trajectory.only())
+                    evaluated[agent.name].append(without_steps)
             for agent in actors:
                 for radius in settings.goal_radii:
                     labels = _labels(agent, world, radius)
@@ -148,12 +124,12 @@ def _batches(
 ) -> Iterator[EpisodeBatch]:
     """The episodes of all training seeds under all evaluation seeds.
 
-    `paths` holds the lengths of the shortest paths of tasks that were met before.
+    `paths` caches the lengths of the shortest paths, m, by task.
     """
     robot_radius = world.env_params.config.robot_radius
-    wanted = tuple(dict.fromkeys(("poses", "goals", *fields)))
+    needed = tuple(dict.fromkeys(("poses", "goals", *fields)))
     for eval_seed, training_seed in product(settings.all_eval_seeds, agent.training_seeds):
-        metrics, trajectory = agent.run(eval_seed, training_seed, world, settings, wanted, on_batch)
+        metrics, trajectory = agent.run(eval_seed, training_seed, world, settings, needed, on_batch)
         # A copy, or the starts would keep all poses in memory.
         starts, goals = np.array(trajectory.poses[0]), np.asarray(trajectory.goals)
         tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()

@@ -1,8 +1,7 @@
 """Greedy episodes of a trained policy, without exploration and without auto-reset.
 
-Episodes are run `BATCH` at a time whatever is asked for, by the same compiled program whatever of
-them is wanted: an episode then comes out the same bit for bit whether it is run alone or beside
-others, for its score or for its picture.
+Episodes always run `BATCH` at a time in the same compiled program, whatever is returned of them. So
+an episode is the same bit for bit whether it runs alone or beside others, for a score or a picture.
 """
 
 from __future__ import annotations
@@ -32,26 +31,29 @@ from sqn_jax.training.rollout import (
 )
 
 BATCH = 100
-"""Episodes that are run side by side."""
+"""Episodes that run at once."""
 
 
 def episode_keys(key: Array, num_episodes: int) -> Array:
-    """One key [E] for each episode; the first ones are the same however many are asked for."""
+    """One key for each episode, [E]; key i does not depend on the number of episodes."""
     return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_episodes))
 
 
 def start_episodes(
     keys: Array, carry: Array, env_params: EnvParams
 ) -> tuple[RandomDraws, ActorState]:
-    """Start, goal and first observation of the episodes of keys [E], and their randomness [T, E].
+    """Start the episodes of these keys: the random draws of their steps, and the first state.
 
-    All follow from an episode's own key: every policy that is given the same keys and the same
-    world meets the same tasks and the same noise.
+    All follows from an episode's own key, so policies that get the same keys and the same world
+    have the same tasks and the same noise.
 
     Args:
         keys: [E] from `episode_keys`.
-        carry: [E, H] what the robots begin with.
+        carry: [E, H] the initial carry.
         env_params: the world.
+
+    Returns:
+        The random draws [T, E], and the actor state with starts, goals and first observations.
     """
 
     def split(key: Array) -> tuple[Array, RandomDraws]:
@@ -78,15 +80,14 @@ def run_episodes(
     Args:
         keys: [E] from `episode_keys`; independent of any training key.
         params: parameters of one network, without a seed axis.
-        env_params: the world, with the noise it was made with.
-        network: the one the parameters belong to.
-        goal_radii: m, what counts as reaching the goal; by default only `env_params.goal_radius`.
-        fields: of `Trajectory`, those to bring to the host; a step of all of them takes about
-            0.4 kB.
-        on_batch: called after each batch with the number of episodes it held.
+        env_params: the world, with its noise.
+        network: the network of these parameters.
+        goal_radii: m, within which the goal is reached; default: `env_params.goal_radius` only.
+        fields: the fields of `Trajectory` to return; all together take about 0.4 kB per step.
+        on_batch: called after each batch with its number of episodes.
 
     Returns:
-        For each radius one number an episode [E], and the fields of all episodes; NumPy arrays.
+        The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
     """
     radii = goal_radii or [float(env_params.goal_radius)]
     metrics: list[list[EpisodeMetrics]] = []
@@ -94,10 +95,10 @@ def run_episodes(
     for first in range(0, len(keys), BATCH):
         batch = keys[first : first + BATCH]
         full = batch[jnp.arange(BATCH) % len(batch)]
-        own = slice(len(batch))
+        real = slice(len(batch))  # The rest of a batch is padding.
         trajectory = _run_batch(full, params, env_params, network)
-        metrics.append(jax.tree.map(lambda x, own=own: x[own], metrics_of(trajectory, radii)))
-        trajectories.append(jax.device_get(trajectory.only(*fields)).of_robots(own))
+        metrics.append(jax.tree.map(lambda x, real=real: x[real], metrics_of(trajectory, radii)))
+        trajectories.append(jax.device_get(trajectory.only(*fields)).of_robots(real))
         on_batch(len(batch))
 
     def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
@@ -118,7 +119,7 @@ def _run_batch(keys: Array, params: Params, env_params: EnvParams, network: QNet
 def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
     """`episode_metrics` for each radius, m; NumPy arrays [E].
 
-    In a program of their own: whatever the radii, the episodes come from the same one.
+    A program of its own, so that the program of the episodes is the same for all radii.
     """
     needed = trajectory.only("rewards", "poses", "info")
     metrics = [_metrics(needed, jnp.float32(radius)) for radius in goal_radii]
@@ -131,14 +132,14 @@ _metrics = jax.jit(episode_metrics)
 
 @jax.jit
 def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, ActorState]:
-    """Start the episodes of `run_episodes`, for an agent that is no network.
+    """Start the episodes of `run_episodes` for an agent that is not a network.
 
     Args:
         keys: [E] from `episode_keys`.
         env_params: the world.
 
     Returns:
-        The keys [T, E] for `step_by_hand`, and the robots, whose carry is empty [E, 0].
+        The keys [T, E] for `step_by_hand`, and the actor state, whose carry is empty [E, 0].
     """
     draws, actors = start_episodes(keys, jnp.zeros((len(keys), 0)), env_params)
     return draws.step_keys, actors
@@ -148,5 +149,5 @@ def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, ActorState
 def step_by_hand(
     step_keys: Array, actors: ActorState, actions: Array, env_params: EnvParams
 ) -> tuple[ActorState, Trajectory]:
-    """`rollout.step_actors`: advance all robots by actions [E] chosen outside."""
+    """Compiled `rollout.step_actors`: one step with actions [E] chosen on the host."""
     return step_actors(step_keys, actors, actions, env_params)

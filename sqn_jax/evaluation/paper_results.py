@@ -1,4 +1,4 @@
-"""What the paper reports, to stand beside our own numbers."""
+"""The results reported in the paper, for comparison with ours."""
 
 from __future__ import annotations
 
@@ -17,4 +17,4 @@ PAPER_RESULTS: dict[str, dict[str, tuple[float, float]]] = {
 }
 """Success and time steps, table I of the paper, by algorithm and the name of our map.
 
-The paper's own maps are not published: ours are others."""
+The maps of the paper are not published; ours are similar but not the same."""

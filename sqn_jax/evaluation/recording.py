@@ -1,9 +1,9 @@
-"""Episodes for pictures: a view of the very episodes that an evaluation has.
+"""Recorded episodes for pictures; they are the same episodes as those of an evaluation.
 
-`record` goes from a policy and the name of a map to such episodes on the host. They come from
-`episodes.run_episodes`, that is from the compiled program of the evaluation. The points covered on
-the way are the only thing it does not put out, since they take up to several kB a step: the
-simulator's own functions count them again along the poses, in a program of their own.
+`record` takes a policy and the name of a map and returns such episodes on the host. They come from
+`episodes.run_episodes`, the compiled program of the evaluation. It does not return the covered
+points, which take up to several kB per step: functions of the simulator compute them again from the
+poses, in another program.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sqn_jax.env import EnvParams
 from sqn_jax.env.coverage import Lattice
 from sqn_jax.env.geometry import beam_angles, wrap_angle
 from sqn_jax.env.navigation import covered_along
-from sqn_jax.evaluation.agents import Learnt
+from sqn_jax.evaluation.agents import TrainedAgent
 from sqn_jax.evaluation.compare import load_maps
 from sqn_jax.evaluation.episodes import episode_keys, run_episodes
 from sqn_jax.evaluation.settings import (
@@ -43,23 +43,23 @@ Floats = NDArray[np.floating]
 RECORDED = tuple(
     field.name for field in dataclasses.fields(Trajectory) if field.name not in ("carry", "covered")
 )
-"""The fields of a trajectory that an `Episode` is made from; `covered` is added to them."""
+"""The fields of a trajectory that are recorded; `covered` is computed from the poses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode of T steps on the host, with all that a picture of it needs; NumPy arrays.
+    """One episode of T steps on the host, with all that pictures need; NumPy arrays.
 
-    Arrays of T + 1 hold what was before each step, and after the last.
+    Arrays of length T + 1 have the values before each step, and after the last.
     """
 
     agent: str
-    """Who acted."""
+    """Name of the agent."""
     occupancy_map: OccupancyMap
     env_params: EnvParams
     """The world that was made from the map."""
     trajectory: Trajectory
-    """What happened, [T, ...] or [T + 1, ...], without an axis of robots."""
+    """[T, ...] or [T + 1, ...], without an axis of robots."""
 
     @property
     def poses(self) -> Floats:
@@ -75,7 +75,7 @@ class Episode:
 
     @cached_property
     def ranges(self) -> Floats:
-        """[T + 1, R] m, what the agent saw, with noise where there is any."""
+        """[T + 1, R] m, the ranges the agent saw, including noise."""
         ranges: Floats = self.trajectory.obs.ranges * self.max_range
         return ranges
 
@@ -93,50 +93,50 @@ class Episode:
 
     @cached_property
     def reward_parts(self) -> Floats:
-        """[T, 3] navigation, exploration and time, weighted: their sum is the reward."""
+        """[T, 3] the weighted terms navigation, exploration and time; their sum is the reward."""
         names = ("reward_navigation", "reward_exploration", "reward_time")
         parts = np.stack([self.trajectory.info[name] for name in names], axis=-1)
         return parts * np.asarray(self.env_params.reward_weights)
 
     @property
     def goal_distances(self) -> Floats:
-        """[T] m, in a straight line, after each step."""
+        """[T] m, straight-line distance to the goal after each step."""
         distances: Floats = self.trajectory.info["goal_distance"]
         return distances
 
     @property
     def reachable(self) -> NDArray[np.bool_]:
-        """[T] whether the goal was in view and not hidden after each step (paper eq. 8)."""
+        """[T] whether the goal was in view and not hidden after each step (paper, eq. 8)."""
         reachable: NDArray[np.bool_] = self.trajectory.info["reward_navigation"] > 0
         return reachable
 
     @property
     def collisions(self) -> NDArray[np.bool_]:
-        """[T] the move was refused."""
+        """[T] whether the move was refused."""
         collisions: NDArray[np.bool_] = self.trajectory.info["collision"]
         return collisions
 
     @property
     def skill_weights(self) -> Floats:
-        """[T, K] the skill decision."""
+        """[T, K] skill weights, 0..1 (paper, eq. 4)."""
         weights: Floats = self.trajectory.output.skill_weights
         return weights
 
     @property
     def skill_q_values(self) -> Floats:
-        """[T, K, A] action values of each skill."""
+        """[T, K, A] action values of each skill (paper, eq. 5)."""
         values: Floats = self.trajectory.output.skill_q_values
         return values
 
     @property
     def q_values(self) -> Floats:
-        """[T, A] their weighted sum, by which the action was chosen."""
+        """[T, A] action values: the weighted sum of those of the skills."""
         values: Floats = self.trajectory.output.q_values
         return values
 
     @property
     def max_range(self) -> float:
-        """m."""
+        """Range of the sensor, m."""
         return self.env_params.config.max_range
 
     @property
@@ -161,7 +161,7 @@ class Episode:
 
     @property
     def lattice(self) -> Lattice:
-        """Where the points lie that were covered."""
+        """The lattice of the points that can be covered."""
         return self.env_params.lattice
 
     @property
@@ -181,20 +181,20 @@ class Episode:
         return int(inside.argmax()) + 1 if inside.any() else self.num_steps
 
     def first_steps(self, count: int) -> Episode:
-        """The beginning of the episode, at most all of it."""
+        """The first `count` steps of the episode, at most all."""
         return dataclasses.replace(self, trajectory=self.trajectory.first_steps(count))
 
     def goal_headings(self) -> Floats:
-        """[T + 1] rad in [-pi, pi), direction of the goal from the robot's heading."""
+        """[T + 1] rad in [-pi, pi), direction of the goal relative to the heading."""
         x, y, heading = self.poses.T
         return wrap_angle(np.arctan2(self.goal[1] - y, self.goal[0] - x) - heading)
 
     def beam_angles(self) -> Floats:
-        """[R] directions of the beams from the heading, rad, from the rightmost to the leftmost."""
+        """[R] rad, directions of the beams relative to the heading, from right to left."""
         return beam_angles(self.env_params.config)
 
     def beam_ends(self, index: int) -> Floats:
-        """[R, 2] m, where the beams end on the map before step `index` (0..T)."""
+        """[R, 2] x m, y m, the ends of the beams on the map before step `index` (0..T)."""
         x, y, heading = self.poses[index]
         angles = heading + self.beam_angles()
         reach = self.ranges[index]
@@ -206,7 +206,7 @@ class Episode:
         return (covered[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(bool)
 
     def covered_points(self, index: int) -> Floats:
-        """[P, 2] m, the points seen before step `index` (0..T), each for `lattice.cell` squared."""
+        """[P, 2] x m, y m, points seen before step `index` (0..T); each has the area `cell`²."""
         return self.lattice.points()[self.covered_bits(index)]
 
     def covered_mask(self, index: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -217,7 +217,7 @@ class Episode:
             shape: rows and columns of the image; row 0 is at the bottom.
 
         Returns:
-            [rows, columns], whether the point of the lattice nearest to each pixel has been seen.
+            [rows, columns] bool, whether the lattice point nearest to each pixel has been seen.
         """
         width, height = self.occupancy_map.size_m
         x = (np.arange(shape[1]) + 0.5) * width / shape[1]
@@ -238,17 +238,20 @@ def record(
     max_steps: int = 0,
     index: int = 0,
 ) -> list[Episode]:
-    """Run a policy greedily and keep everything: the first episodes of `sqn evaluate`'s.
+    """Run greedy episodes of a policy and record them: the first ones of `sqn evaluate`.
 
     Args:
-        policy: who acts.
+        policy: the policy.
         map_name: a map of the project, or a file.
-        tasks: from the evaluation points or between random pairs of spawn points.
-        episodes: how many.
+        tasks: between evaluation points, or random pairs of spawn points.
+        episodes: the number of episodes.
         seed: the evaluation seed.
-        noise: of the velocity and of the ranges, in the units the policy was configured with.
-        max_steps: steps an episode; 0 for the map's own limit.
-        index: which of the policy's training seeds.
+        noise: of the velocity and of the ranges, in the units of the policy's config.
+        max_steps: steps per episode; 0: the limit of the map.
+        index: of the training seed in the policy.
+
+    Returns:
+        The episodes.
 
     Raises:
         ValueError: the map is unusable, or a setting is out of its range.
@@ -258,7 +261,7 @@ def record(
     if not 0 <= index < len(policy.params):
         raise ValueError(f"index is {index}, expected 0 to {len(policy.params) - 1}")
     settings = Settings((map_name,), (tasks,), episodes, 1, seed, (noise,), max_steps=max_steps)
-    agent = Learnt(policy.config.algo, (policy,))
+    agent = TrainedAgent(policy.config.algo, (policy,))
     maps = load_maps([agent], settings)
     (world,) = worlds(robot_for(agent.env_config, settings), maps, settings)
     keys = episode_keys(task_key(seed, tasks), episodes)
@@ -266,25 +269,25 @@ def record(
 
 
 def record_episodes(
-    keys: Array, agent: Learnt, training_seed: int | None, world: World
+    keys: Array, agent: TrainedAgent, training_seed: int | None, world: World
 ) -> list[Episode]:
-    """Run a policy greedily in a world that is there already, and keep everything.
+    """Run greedy episodes in a world and record them.
 
     Args:
-        keys: [E] from `episode_keys`, of which an evaluation seed has the first ones.
-        agent: who acts.
-        training_seed: with the parameters of which seed.
-        world: where.
+        keys: [E] from `episode_keys`.
+        agent: the agent.
+        training_seed: selects the parameters of the agent.
+        world: the world.
 
     Returns:
-        The episodes; a step takes about 0.5 kB, and its covered points up to several kB more.
+        The episodes; a step takes about 0.5 kB, plus up to several kB for its covered points.
     """
     params, env_params = agent.params(training_seed), world.env_params
-    _, recorded = run_episodes(keys, params, env_params, agent.network, fields=RECORDED)
-    covered = jax.device_get(_covered(recorded.poses, env_params))
-    recorded = dataclasses.replace(recorded, covered=covered)
+    _, trajectory = run_episodes(keys, params, env_params, agent.network, fields=RECORDED)
+    covered = jax.device_get(_covered(trajectory.poses, env_params))
+    trajectory = dataclasses.replace(trajectory, covered=covered)
     return [
-        Episode(agent.name, world.occupancy_map, env_params, recorded.of_robots(index))
+        Episode(agent.name, world.occupancy_map, env_params, trajectory.of_robots(index))
         for index in range(len(keys))
     ]
 

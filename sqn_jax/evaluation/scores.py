@@ -1,6 +1,6 @@
-"""From batches of episodes to numbers: statistics of an evaluation, records, a table.
+"""Statistics of batches of episodes, records of single episodes, and the table of results.
 
-NumPy on the host; knows nothing of how the episodes came about.
+NumPy on the host.
 """
 
 from __future__ import annotations
@@ -31,27 +31,28 @@ def describe(
 
     Args:
         batches: one for each training seed and evaluation seed, of equally many episodes.
-        goal_radius: m, what counts as reaching the goal.
-        oracle: those of the oracle on the same tasks, one for each evaluation seed.
+        goal_radius: m, within which the goal is reached.
+        oracle: batches of the oracle on the same tasks, one for each evaluation seed.
 
     Returns:
-        `success`, `time_steps` (failures at the limit), `time_steps_success` (None without a
-        success), `steps_over_oracle` (of each success over the oracle's in the same task; None
-        without), `spl` (None where no shortest ways are known), `mean_reward`, `collisions`,
-        `coverage_m2`: each with the `mean`, the `std` over episodes, a 95 % interval `ci95` over
-        episodes (Wilson for `success`, bootstrap for the others) and `std_of_means`, that of the
-        means of the (training seed, evaluation seed) pairs: for one training seed what the paper
-        gives. Both are sample standard deviations (n - 1), None for a single value.
-        With several training seeds also `iqm` and `iqm_ci95`, the interquartile mean over them;
-        the intervals over episodes say nothing of how much training seeds differ.
+        `success`, `time_steps` (failures count the limit), `time_steps_success` (None without a
+        success), `steps_over_oracle` (steps of a success, divided by the oracle's in the same task;
+        None without a success or without an oracle), `spl` (None where shortest paths are unknown),
+        `mean_reward`, `collisions`, `coverage_m2`. Each has the `mean`, the `std` over episodes, a
+        95 % interval `ci95` over episodes (Wilson for `success`, bootstrap for the others), and
+        `std_of_means` over the means of the (training seed, evaluation seed) pairs; for one
+        training seed this is the spread in the paper. Both are sample standard deviations (n - 1),
+        None for a single value. With several training seeds there are also `iqm` and `iqm_ci95`,
+        the interquartile mean over them: intervals over episodes do not cover the differences
+        between training seeds.
     """
     metrics = [batch.numbers(goal_radius) for batch in batches]
     result: dict[str, Any] = {}
     names = ("success", "time_steps", "spl", "mean_reward", "collisions", "coverage_m2")
     for name in names:
         values = [metric[name] for metric in metrics if name in metric]
-        known = len(values) == len(metrics)
-        result[name] = _describe(name, values, batches, goal_radius) if known else None
+        is_known = len(values) == len(metrics)
+        result[name] = _describe(name, values, batches, goal_radius) if is_known else None
     steps = [metric["time_steps"][metric["success"] > 0] for metric in metrics]
     result["time_steps_success"] = _over_episodes(np.concatenate(steps))
     ratios = _steps_over_oracle(batches, goal_radius, oracle or [])
@@ -63,14 +64,14 @@ def describe(
 def _steps_over_oracle(
     batches: Sequence[EpisodeBatch], goal_radius: float, oracle: Sequence[EpisodeBatch]
 ) -> NDArray[np.float64]:
-    """Steps over the oracle's, of every task in which both arrive."""
-    same = {each.eval_seed: each for each in oracle}
+    """Steps divided by the oracle's, for every task in which both reach the goal."""
+    oracle_batches = {batch.eval_seed: batch for batch in oracle}
     ratios = [np.empty(0)]
-    for batch in (batch for batch in batches if batch.eval_seed in same):
+    for batch in (batch for batch in batches if batch.eval_seed in oracle_batches):
         ours = batch.numbers(goal_radius)
-        theirs = same[batch.eval_seed].numbers(goal_radius)
-        both = (ours["success"] > 0) & (theirs["success"] > 0)
-        ratios.append(ours["time_steps"][both] / theirs["time_steps"][both])
+        theirs = oracle_batches[batch.eval_seed].numbers(goal_radius)
+        reached = (ours["success"] > 0) & (theirs["success"] > 0)
+        ratios.append(ours["time_steps"][reached] / theirs["time_steps"][reached])
     return np.concatenate(ratios)
 
 
@@ -81,16 +82,16 @@ def _describe(
     goal_radius: float,
 ) -> dict[str, Any]:
     joined = np.concatenate(values)
-    told = _over_episodes(joined)
-    assert told is not None
+    description = _over_episodes(joined)
+    assert description is not None
     if name == "success":
-        told["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
-    told["std_of_means"] = sample_std([value.mean() for value in values])
+        description["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
+    description["std_of_means"] = sample_std([value.mean() for value in values])
     scores = _of_each_seed(name, batches, goal_radius)
     if len(scores) > 1:
-        told["iqm"] = interquartile_mean(scores)
-        told["iqm_ci95"] = list(stratified_bootstrap([scores], interquartile_mean))
-    return told
+        description["iqm"] = interquartile_mean(scores)
+        description["iqm_ci95"] = list(stratified_bootstrap([scores], interquartile_mean))
+    return description
 
 
 def _of_each_seed(name: str, batches: Sequence[EpisodeBatch], goal_radius: float) -> list[float]:
@@ -116,12 +117,12 @@ def improvement(
     theirs: Sequence[Sequence[EpisodeBatch]],
     goal_radius: float,
 ) -> Any:
-    """Probability that a training run of ours has more success than one of theirs.
+    """Probability that a training run of one agent has more success than one of another.
 
     Args:
-        ours: for each task (map) the episodes of an agent, of the same training seeds.
-        theirs: the same for another agent.
-        goal_radius: m, what counts as reaching the goal.
+        ours: for each task (map) the batches of one agent; its training seeds are the same in all.
+        theirs: the same for the other agent.
+        goal_radius: m, within which the goal is reached.
 
     Returns:
         `probability` and its `ci95` over training seeds; None unless both agents have several.
@@ -141,7 +142,7 @@ def improvement(
 def records(
     batches: Sequence[EpisodeBatch], goal_radius: float, /, **labels: Any
 ) -> Iterator[dict[str, Any]]:
-    """One flat object an episode, ready for JSON lines."""
+    """One flat object per episode, ready for JSON lines."""
     for batch in batches:
         numbers = batch.numbers(goal_radius)
         for episode in range(len(batch.goals)):
@@ -176,31 +177,32 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def results_table(results: Sequence[dict[str, Any]]) -> str:
-    """The results of an evaluation file as a Markdown table, one row an agent and world.
+    """The results of an evaluation file as a Markdown table: one row for each agent and world.
 
-    The first goal radius in the file is the one shown; further ones appear as a column of success.
+    Numbers are for the first goal radius in the file; further radii have a column of success each.
     """
     radii = list(dict.fromkeys(entry["goal_radius"] for entry in results))
     header = ["map", "agent", "noise", *(f"success {radius:g} m" for radius in radii)]
     header += ["steps", "steps (reached)", "over oracle", "SPL", "collisions", "reward"]
     rows = []
     for entry in (entry for entry in results if entry["goal_radius"] == radii[0]):
-        same = [other for other in results if _world_of(other) == _world_of(entry)]
-        successes = [f"{other['success']['mean']:.2f}" for other in same]
+        same_row = [other for other in results if _row_of(other) == _row_of(entry)]
+        successes = [f"{other['success']['mean']:.2f}" for other in same_row]
         if (spread := entry["success"]["std_of_means"]) is not None:
             successes[0] += f" ± {spread:.2f}"
         tasks = "" if entry["tasks"] == "evaluation points" else f" ({entry['tasks']})"
         cells = [entry["map"] + tasks, entry["agent"], _noise_of(entry), *successes]
         shown = (("time_steps", 1), ("time_steps_success", 1), ("steps_over_oracle", 2), ("spl", 2))
         for name, digits in shown:
-            told = entry.get(name)
-            cells.append("-" if told is None else f"{told['mean']:.{digits}f}")
+            metric = entry.get(name)
+            cells.append("-" if metric is None else f"{metric['mean']:.{digits}f}")
         cells += [f"{entry['collisions']['mean']:.1f}", f"{entry['mean_reward']['mean']:.2f}"]
         rows.append(cells)
     return markdown_table(header, rows)
 
 
-def _world_of(entry: dict[str, Any]) -> tuple[Any, ...]:
+def _row_of(entry: dict[str, Any]) -> tuple[Any, ...]:
+    """Agent and world of an entry: what its row in the table stands for."""
     names = ("map", "agent", "tasks", "velocity_noise", "range_noise")
     return tuple(entry[name] for name in names)
 

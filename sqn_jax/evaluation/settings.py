@@ -1,4 +1,4 @@
-"""What is evaluated: maps, tasks, noise and seeds, and the worlds that they make."""
+"""The settings of an evaluation: maps, tasks, noise and seeds; and the worlds made from them."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
     "evaluation points": "evaluation",
     "random pairs": "training",
 }
-"""The two kinds of tasks, and the spawn mode that draws them."""
+"""The two kinds of tasks, and the spawn mode of each."""
 
 MOST_EPISODES, MOST_STEPS = 100_000, 100_000
-"""Under one evaluation seed, and an episode: more would not fit into memory."""
+"""Limits of episodes per evaluation seed and steps per episode; more would not fit into memory."""
 
 Maps = Mapping[tuple[str, float], OccupancyMap]
-"""Maps by their name in the settings and the radius of the robot, m, they were loaded for."""
+"""Maps by their name in the settings and the robot radius, m, for which they were loaded."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What an evaluation is made of."""
+    """Settings of an evaluation."""
 
     maps: tuple[str, ...]
-    """Maps of the project by name, or files."""
+    """Names of maps of the project, or files."""
     tasks: tuple[Tasks, ...] = ("evaluation points",)
     episodes: int = 100
     """Episodes under each evaluation seed."""
     eval_seeds: int = 5
-    """How many evaluation seeds."""
+    """Number of evaluation seeds."""
     seed: int = 1_000
-    """The first of them."""
+    """The first evaluation seed."""
     noise: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     """Pairs of velocity noise and range noise."""
     noise_unit: Literal["relative", "absolute"] | None = None
-    """Reading of both, see `EnvConfig`; None as each robot was configured."""
+    """Unit of both, see `EnvConfig`; None: as each robot was configured."""
     goal_radii: tuple[float, ...] = (0.3, 0.5)
-    """m; each radius is judged from the same episodes."""
+    """m; success is computed for each radius from the same episodes."""
     max_steps: int = 0
-    """Steps an episode; 0 for each map's own limit."""
+    """Steps per episode; 0: the limit of each map."""
 
     @property
     def all_eval_seeds(self) -> list[int]:
-        """The evaluation seeds, one after the other."""
+        """The evaluation seeds, which are consecutive."""
         return [self.seed + index for index in range(self.eval_seeds)]
 
     def __post_init__(self) -> None:
@@ -75,17 +75,17 @@ class Settings:
             if not 1e-6 <= radius <= 1e6:
                 raise ValueError(f"goal radius is {radius}, expected 0.000001 to 1000000 m")
         for name in ("maps", "tasks", "noise", "goal_radii"):
-            given = getattr(self, name)
-            for one in given:
-                if given.count(one) > 1:
-                    raise ValueError(f"{name}: {one} comes twice, expected each once")
+            values = getattr(self, name)
+            for value in values:
+                if values.count(value) > 1:
+                    raise ValueError(f"{name}: {value} comes twice, expected each once")
         if not (self.maps and self.tasks and self.noise and self.goal_radii):
             raise ValueError("nothing to evaluate: expected a map, a task and a goal radius")
 
 
 @dataclass(frozen=True)
 class World:
-    """A map made ready for a robot, some tasks and some noise."""
+    """A map prepared for a robot, with one kind of tasks and one level of noise."""
 
     occupancy_map: OccupancyMap
     env_params: EnvParams
@@ -94,7 +94,7 @@ class World:
 
 
 def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
-    """The robot and its sensors, without what belongs to training or comes from the settings."""
+    """The robot of an agent under the settings of an evaluation, yet without noise."""
     return dataclasses.replace(
         env_config,
         max_steps=settings.max_steps,
@@ -107,15 +107,15 @@ def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
 
 
 def worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
-    """Every map, task and noise of an evaluation for a robot from `robot_for`."""
+    """Every world (map, kind of tasks, noise) of an evaluation for a robot from `robot_for`."""
     for name in settings.maps:
         occupancy_map = maps[name, robot.robot_radius]
         for tasks in settings.tasks:
-            quiet = make_env(occupancy_map, robot, spawn=SPAWN_MODES[tasks])
+            without_noise = make_env(occupancy_map, robot, spawn=SPAWN_MODES[tasks])
             for noise in settings.noise:
-                yield World(occupancy_map, with_noise(quiet, *noise), tasks, noise)
+                yield World(occupancy_map, with_noise(without_noise, *noise), tasks, noise)
 
 
 def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
-    """The key of the episodes of an evaluation seed; every agent gets the same."""
+    """The key of the episodes of an evaluation seed; it is the same for every agent."""
     return jax.random.fold_in(jax.random.key(eval_seed), list(SPAWN_MODES).index(tasks))

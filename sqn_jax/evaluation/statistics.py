@@ -1,7 +1,7 @@
-"""Scores and intervals for what an evaluation measured. NumPy and SciPy, on the host.
+"""Scores and confidence intervals of an evaluation. NumPy and SciPy, on the host.
 
-`scipy.stats` takes half a second to import, and training starts without it: it is imported where it
-is used.
+`scipy.stats` takes half a second to import and is not needed in training, so the functions that use
+it import it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval for a success rate; sensible at 0 and at 1 too.
+    """Wilson's score interval for a success rate; valid at 0 and at 1 too.
 
     Raises:
         ValueError: no trials.
@@ -52,8 +52,8 @@ def sample_std(values: ArrayLike) -> float | None:
 def interquartile_mean(scores: ArrayLike) -> float:
     """Mean of the middle half of all scores, runs and tasks together (Agarwal et al. 2021).
 
-    A quarter of the values, rounded down, is left out at each end; so few that none is, and it is
-    the plain mean.
+    A quarter of the values, rounded down, is left out at each end. With fewer than four values it
+    is the mean.
     """
     from scipy import stats
 
@@ -64,7 +64,7 @@ def probability_of_improvement(ours: ArrayLike, theirs: ArrayLike) -> float:
     """Probability that a run of ours beats a run of theirs; a tie counts one half.
 
     Args:
-        ours: [K] scores, one a training run, or [K, M] on M tasks, over which it is averaged.
+        ours: [K] scores of K training runs, or [K, M] on M tasks, over which it is averaged.
         theirs: [L] or [L, M].
     """
     first, second = (_runs_by_tasks(scores) for scores in (ours, theirs))
@@ -81,14 +81,14 @@ def stratified_bootstrap(
 ) -> tuple[float, float]:
     """Percentile interval of a statistic over training runs (Agarwal et al. 2021).
 
-    Runs are drawn with replacement, for each task and each sample on its own.
+    Runs are drawn with replacement, separately for each task and each sample.
 
     Args:
         samples: one or more arrays [K] or [K, M]: K runs, M tasks.
-        statistic: takes as many arrays [K, M] and returns a number.
+        statistic: a function of as many arrays [K, M] that returns a number.
         confidence: of the interval.
-        resamples: how often to draw.
-        seed: of the draws.
+        resamples: the number of resamples.
+        seed: of the random draws.
     """
     rng = np.random.default_rng(seed)
     arrays = [_runs_by_tasks(sample) for sample in samples]
@@ -105,17 +105,20 @@ def stratified_bootstrap(
 def success_weighted_path_length(
     success: ArrayLike, path_length: ArrayLike, shortest: ArrayLike
 ) -> NDArray[np.float64]:
-    """SPL of each episode (Anderson et al. 2018): success x shortest / max(driven, shortest).
+    """SPL of each episode (Anderson et al. 2018): success x shortest / max(length, shortest).
 
     Args:
         success: [E] bool.
-        path_length: [E] m driven up to the goal.
-        shortest: [E] m, length of the shortest way; a start at the goal (0) counts as 1.
+        path_length: [E] m, length of the robot's path up to the goal.
+        shortest: [E] m, length of the shortest path; where it is 0, the ratio is 1.
+
+    Returns:
+        [E] in 0..1.
     """
-    driven, way = np.asarray(path_length, np.float64), np.asarray(shortest, np.float64)
-    longer = np.maximum(driven, way)
-    share = np.divide(way, longer, out=np.ones_like(longer), where=longer > 0)
-    return np.asarray(success, bool) * share
+    length, shortest_length = np.asarray(path_length, np.float64), np.asarray(shortest, np.float64)
+    longer = np.maximum(length, shortest_length)
+    ratio = np.divide(shortest_length, longer, out=np.ones_like(longer), where=longer > 0)
+    return np.asarray(success, bool) * ratio
 
 
 def _runs_by_tasks(scores: ArrayLike) -> NDArray[np.float64]:

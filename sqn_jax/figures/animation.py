@@ -1,7 +1,7 @@
 """An episode as a film: the map as the robot gets to know it, its own view, skills and reward.
 
 What does not change is drawn once and kept as pixels. A frame is a copy of them into Matplotlib's
-canvas, the map panel coloured directly, pixel by pixel, and the few artists that move drawn on top.
+canvas, the map panel colored directly, pixel by pixel, and the few artists that move drawn on top.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from sqn_jax.evaluation.recording import Episode
-from sqn_jax.figures.screen import HEIGHT, KEY_COLOURS, WIDTH, Screen, last_step, rgb
+from sqn_jax.figures.screen import HEIGHT, KEY_COLORS, WIDTH, Screen, last_step, rgb
 from sqn_jax.storage.files import written_whole
 
 Frame = NDArray[np.uint8]
@@ -30,7 +30,7 @@ PALETTE_FRAMES = 8
 """Frames that the palette of a GIF is made from."""
 
 UNCHANGED = 255
-"""The last of a GIF's 256 colours is transparent: there the frame before shows through. What does
+"""The last of a GIF's 256 colors is transparent: there the frame before shows through. What does
 not change takes hardly any room so."""
 
 
@@ -73,7 +73,7 @@ def gif(
 ) -> bytes:
     """A film as an animated GIF that repeats; the last frame stands for a second.
 
-    All frames share one palette, made from some of them and from the colours that mean something.
+    All frames share one palette, made from some of them and from the colors that mean something.
 
     Args:
         episode: what happened.
@@ -206,33 +206,33 @@ def frame_size(width_px: int) -> tuple[int, int]:
 
 
 class _Palette:
-    """The colours of a GIF: those that mean something, and others by how often they come.
+    """The colors of a GIF: those that mean something, and others by how often they come.
 
     The first ones as they are, since the few pixels of a robot or a goal would not get a place.
     """
 
     def __init__(self, samples: list[Frame]) -> None:
-        key_colours = np.unique([rgb(colour) for colour in KEY_COLOURS], axis=0)
+        key_colors = np.unique([rgb(color) for color in KEY_COLORS], axis=0)
         stacked = Image.fromarray(np.concatenate(samples))
-        others = stacked.quantize(UNCHANGED - len(key_colours), Image.Quantize.MEDIANCUT)
+        others = stacked.quantize(UNCHANGED - len(key_colors), Image.Quantize.MEDIANCUT)
         found = np.asarray(others.getpalette(), np.uint8).reshape(-1, 3)
-        table = np.concatenate([key_colours, found])[:UNCHANGED]
+        table = np.concatenate([key_colors, found])[:UNCHANGED]
         self._tree = cKDTree(table)
         self.table = np.pad(table, ((0, 256 - len(table)), (0, 0)))
         """[256, 3] uint8."""
         self._known = np.full(2**24, -1, np.int16)
 
     def indices(self, frame: Frame) -> Frame:
-        """[h, w] uint8, the nearest colour of the palette for each pixel.
+        """[h, w] uint8, the nearest color of the palette for each pixel.
 
-        Not by Pillow, which takes a near one for the nearest. A colour is looked for once.
+        Not by Pillow, which takes a near one for the nearest. A color is looked for once.
         """
         red, green, blue = np.moveaxis(frame.astype(np.int32), -1, 0)
         codes = red << 16 | green << 8 | blue
         told = self._known[codes]
         if (told < 0).any():
             new = np.unique(codes[told < 0])
-            colours = np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1)
-            self._known[new] = self._tree.query(colours)[1]
+            colors = np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1)
+            self._known[new] = self._tree.query(colors)[1]
             told = self._known[codes]
         return told.astype(np.uint8)

@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from sqn_jax.evaluation.statistics import bootstrap_interval
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
+from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 
 Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
@@ -29,12 +29,12 @@ def _metric(rows: Rows, name: str) -> Floats:
 
 
 def _draw_curve(
-    axes: Axes, episodes: Floats, values: Floats, colour: str, label: str = "", style: str = "-"
+    axes: Axes, episodes: Floats, values: Floats, color: str, label: str = "", style: str = "-"
 ) -> None:
     """Draw [R, S]: the mean bold and, if there are several, each seed thin behind it."""
     # One point makes no line.
     marker = "o" if len(episodes) == 1 else ""
-    look: dict[str, Any] = {"color": colour, "linestyle": style, "marker": marker}
+    look: dict[str, Any] = {"color": color, "linestyle": style, "marker": marker}
     if values.shape[1] > 1:
         axes.plot(episodes, values, ms=3, lw=0.8, alpha=0.4, **look)
     # Masked, since nanmean warns of rows without any number.
@@ -67,7 +67,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     lines, columns = (2, 2) if skills > 1 else (1, 3)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
     panels[0].set_title("mean reward a step", fontsize=11)
-    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLOURS[0])
+    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLORS[0])
     _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
     _draw_loss(panels[2], episodes, _metric(rows, "loss"))
     if skills > 1:
@@ -92,7 +92,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
 def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
     """Success, with the share of random actions that it suffers from."""
     axes.set_title("success under exploration noise", fontsize=11)
-    _draw_curve(axes, episodes, success, COLOURS[2], "success")
+    _draw_curve(axes, episodes, success, COLORS[2], "success")
     if np.isfinite(epsilon).any():
         _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
     _finish_shares(axes)
@@ -100,7 +100,7 @@ def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats
 
 def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
     axes.set_title("loss", fontsize=11)
-    _draw_curve(axes, episodes, loss, COLOURS[1])
+    _draw_curve(axes, episodes, loss, COLORS[1])
     if not np.isfinite(loss).any():
         axes.text(0.5, 0.5, "no update yet", transform=axes.transAxes, ha="center", color="0.4")
         axes.set_yticks([])
@@ -113,8 +113,8 @@ def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -
     axes.set_title("weight of the skills", fontsize=11)
     skills = usage.shape[2]
     for skill in range(skills):
-        colour = COLOURS[skill % len(COLOURS)]
-        _draw_curve(axes, episodes, usage[..., skill], colour, f"skill {skill + 1}")
+        color = COLORS[skill % len(COLORS)]
+        _draw_curve(axes, episodes, usage[..., skill], color, f"skill {skill + 1}")
     if np.isfinite(entropy).any():
         share = entropy / math.log(skills)
         _draw_curve(axes, episodes, share, INK, f"gate entropy / log {skills}", ":")
@@ -173,7 +173,7 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
         episodes = np.array([row["episodes"] for row in rows_of_runs[0][:length]], float)
         for axes, name in zip(panels, ("mean_reward", "success"), strict=True):
             values = np.concatenate([_metric(rows[:length], name) for rows in rows_of_runs], axis=1)
-            _draw_band(axes, episodes, values, COLOURS[number % len(COLOURS)], plain(agent))
+            _draw_band(axes, episodes, values, COLORS[number % len(COLORS)], plain(agent))
     for axes, name in zip(panels, ("mean reward a step", "success while training"), strict=True):
         axes.set_title(name, fontsize=11)
         axes.set_xlabel("episodes")
@@ -186,13 +186,13 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
 
 
 def _draw_band(
-    axes: Axes, episodes: NDArray[Any], values: NDArray[Any], colour: str, label: str
+    axes: Axes, episodes: NDArray[Any], values: NDArray[Any], color: str, label: str
 ) -> None:
     """Mean of values [R, S] over the seeds, and its interval where there are several."""
-    axes.plot(episodes, values.mean(axis=1), color=colour, lw=2, label=label)
+    axes.plot(episodes, values.mean(axis=1), color=color, lw=2, label=label)
     if values.shape[1] > 1:
         low, high = np.array([bootstrap_interval(row, resamples=400) for row in values]).T
-        axes.fill_between(episodes, low, high, color=colour, alpha=0.2, lw=0)
+        axes.fill_between(episodes, low, high, color=color, alpha=0.2, lw=0)
 
 
 def gate_entropy_curves(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
@@ -228,14 +228,12 @@ def gate_entropy_curves(rows_by_run: Mapping[str, Rows], *, title: str) -> Figur
     figure = Figure(figsize=(WIDTH_IN, 3.7), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False)[0]
     for number, (run, rows) in enumerate(rows_by_run.items()):
-        colour = COLOURS[number % len(COLOURS)]
+        color = COLORS[number % len(COLORS)]
         episodes = _metric(rows, "episodes").max(axis=1)
         largest = math.log(np.shape(rows[0]["skill_usage"])[-1])
-        _draw_curve(
-            panels[0], episodes, _metric(rows, "gate_entropy") / largest, colour, plain(run)
-        )
+        _draw_curve(panels[0], episodes, _metric(rows, "gate_entropy") / largest, color, plain(run))
         if any("skill_distance" in row for row in rows):
-            _draw_curve(panels[1], episodes, _metric(rows, "skill_distance"), colour, plain(run))
+            _draw_curve(panels[1], episodes, _metric(rows, "skill_distance"), color, plain(run))
     for axes, name in zip(panels, names, strict=True):
         axes.set_title(name, fontsize=11)
         axes.set_xlabel("training episodes")

@@ -25,7 +25,7 @@ from sqn_jax.figures.ground import (
     draw_start,
     mark_arrival,
 )
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
+from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 
 Floats = NDArray[np.floating]
 
@@ -82,9 +82,9 @@ def coverage_example(
     above.legend(
         handles=[
             *_mark_handles(),
-            Line2D([], [], color=COLOURS[0], lw=2, label="way so far"),
+            Line2D([], [], color=COLORS[0], lw=2, label="way so far"),
             Patch(fc=SEEN, label="seen so far"),
-            Patch(fc=COLOURS[4], alpha=0.5, label="scan now"),
+            Patch(fc=COLORS[4], alpha=0.5, label="scan now"),
         ],
         **_LEGEND_BELOW,
     )
@@ -108,7 +108,7 @@ def _draw_coverage(axes: Axes, episode: Episode, step: int) -> None:
     """The map as the robot knew it before a step, with its way up to there."""
     draw_seen(axes, episode, step)
     draw_scan(axes, episode, step)
-    axes.plot(*episode.poses[: step + 1, :2].T, color=COLOURS[0], lw=2, zorder=4)
+    axes.plot(*episode.poses[: step + 1, :2].T, color=COLORS[0], lw=2, zorder=4)
     if step:
         draw_start(axes, episode)
     draw_goal(axes, episode)
@@ -119,7 +119,7 @@ def _draw_areas(axes: Axes, episode: Episode, areas: Floats, shown: Sequence[int
     """The seen area [T + 1] over time up to the arrival, or up to the last moment shown."""
     end = max(episode.time_steps, *shown)
     times = np.arange(end + 1) * episode.time_step
-    axes.plot(times, areas[: end + 1], color=COLOURS[2], lw=2)
+    axes.plot(times, areas[: end + 1], color=COLORS[2], lw=2)
     axes.plot(times[list(shown)], areas[list(shown)], "o", ms=6, mfc="white", mec=INK, mew=1.3)
     if episode.success:
         mark_arrival(axes, episode)
@@ -190,7 +190,7 @@ def reachability_example(
         draw_scan(axes, episode, index)
         ends = np.stack([episode.poses[index, :2], episode.goal])
         style = "-" if moment.reachable else (0, (4, 3))
-        axes.plot(*ends.T, color=COLOURS[1], lw=2.2, ls=style, zorder=6)
+        axes.plot(*ends.T, color=COLORS[1], lw=2.2, ls=style, zorder=6)
         draw_goal(axes, episode)
         draw_robot(axes, episode, index, size=0.6)
         _show_around(axes, episode, index)
@@ -201,9 +201,9 @@ def reachability_example(
     figure.legend(
         handles=[
             *marks,
-            Patch(fc=COLOURS[4], alpha=0.5, label="scan"),
-            Line2D([], [], color=COLOURS[1], lw=2.2, label="straight line to the goal, in sight"),
-            Line2D([], [], color=COLOURS[1], lw=2.2, ls=(0, (4, 3)), label="hidden"),
+            Patch(fc=COLORS[4], alpha=0.5, label="scan"),
+            Line2D([], [], color=COLORS[1], lw=2.2, label="straight line to the goal, in sight"),
+            Line2D([], [], color=COLORS[1], lw=2.2, ls=(0, (4, 3)), label="hidden"),
         ],
         **_LEGEND_BELOW,
     )
@@ -259,10 +259,10 @@ def _show_around(axes: Axes, episode: Episode, index: int) -> None:
     """Cut a square out of the map that holds the whole scan; not beyond the map's edges."""
     reach = episode.max_range + 0.5
     sizes = episode.occupancy_map.size_m
-    centre = [float(value) for value in episode.poses[index, :2]]
+    center = [float(value) for value in episode.poses[index, :2]]
     low = [
         min(max(place - reach, 0.0), max(size - 2 * reach, 0.0))
-        for place, size in zip(centre, sizes, strict=True)
+        for place, size in zip(center, sizes, strict=True)
     ]
     axes.set_xlim(low[0], min(low[0] + 2 * reach, sizes[0]))
     axes.set_ylim(low[1], min(low[1] + 2 * reach, sizes[1]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.evaluation.recording import Episode
 from sqn_jax.figures.ground import arrowhead, draw_map
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain
+from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap
 
 MAX_SCANS = 6  # below each map of `observation_patterns`
@@ -34,7 +34,7 @@ def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
     for axes, occupancy_map in zip(panels, maps, strict=True):
         _draw_panel(axes, occupancy_map)
         for number, place in enumerate(occupancy_map.evaluation_points, start=1):
-            _draw_place(axes, place, str(number), COLOURS[1])
+            _draw_place(axes, place, str(number), COLORS[1])
     panels[0].set_ylabel("y [m]", fontsize=8)
     return figure
 
@@ -48,10 +48,10 @@ def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
     axes.set_xlabel("x [m]", fontsize=8)
 
 
-def _draw_place(axes: Axes, place: NDArray[np.floating], name: str, colour: str) -> None:
+def _draw_place(axes: Axes, place: NDArray[np.floating], name: str, color: str) -> None:
     """A dot at a place x m, y m with a short name in it."""
     x, y = (float(value) for value in place)
-    axes.plot(x, y, marker="o", ms=11, color=colour, mec="white")
+    axes.plot(x, y, marker="o", ms=11, color=color, mec="white")
     style: dict[str, Any] = {"color": "white", "fontsize": 7, "fontweight": "bold"}
     axes.annotate(name, (x, y), ha="center", va="center", **style)
 
@@ -92,11 +92,11 @@ def observation_patterns(
         above.locator_params(nbins=6, steps=[1, 2, 5, 10])
         if column == 0:
             above.set_ylabel("y [m]", fontsize=8)
-        # A narrow empty column keeps the patterns of neighbouring maps apart.
+        # A narrow empty column keeps the patterns of neighboring maps apart.
         below = grid[1, column].subgridspec(lines, columns + 1, width_ratios=[1] * columns + [0.1])
         for number, index in enumerate(spread_steps(episode, scans)):
             letter = string.ascii_uppercase[number]
-            _draw_place(above, episode.poses[index, :2], letter, COLOURS[0])
+            _draw_place(above, episode.poses[index, :2], letter, COLORS[0])
             _draw_pattern(
                 figure.add_subplot(below[divmod(number, columns)]), episode, index, letter
             )
@@ -124,8 +124,8 @@ def _draw_pattern(axes: Axes, episode: Episode, index: int, letter: str) -> None
     angles, reach = episode.beam_angles(), episode.ranges[index]
     ends = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=-1)
     outline = np.concatenate([ends, np.zeros((1, 2))])
-    axes.add_patch(Polygon(outline, fc=COLOURS[4], alpha=0.45, ec="none"))
-    axes.plot(*ends.T, ".", ms=2.2, color=COLOURS[0])
+    axes.add_patch(Polygon(outline, fc=COLORS[4], alpha=0.45, ec="none"))
+    axes.plot(*ends.T, ".", ms=2.2, color=COLORS[0])
     axes.add_patch(Circle((0.0, 0.0), episode.max_range, fill=False, ec="0.6", lw=0.8))
     axes.add_patch(arrowhead((0.0, 0.0, 0.0), 0.2 * episode.max_range))
     edge = 1.04 * episode.max_range

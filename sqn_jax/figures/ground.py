@@ -1,4 +1,4 @@
-"""What lies under a path, and the marks on it: map, field, scan, robot, goal, skill colours."""
+"""What lies under a path, and the marks on it: map, field, scan, robot, goal, skill colors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.evaluation.recording import Episode
-from sqn_jax.figures.style import COLOURS, INK, OBSTACLE
+from sqn_jax.figures.style import COLORS, INK, OBSTACLE
 from sqn_jax.maps import OccupancyMap
 
 Floats = NDArray[np.floating]
@@ -29,9 +29,9 @@ UNREACHABLE, RED, YELLOW, FREE, SEEN = "#b9b9b9", "#b00020", "#ffd92f", "#f7f7f4
 
 # Few and light shades, so that their steps read as height lines and paths stand out.
 FIELD_MAP = ListedColormap(np.linspace([0.985, 0.99, 0.975], [0.70, 0.80, 0.82], 12))
-# From skill 2's colour over grey to skill 1's; the dark edge of a path keeps the grey visible.
-SKILL_MAP = LinearSegmentedColormap.from_list("skills", [COLOURS[1], "#dcdcdc", COLOURS[0]], 255)
-ONE_SKILL = COLOURS[3]
+# From skill 2's color over gray to skill 1's; the dark edge of a path keeps the gray visible.
+SKILL_MAP = LinearSegmentedColormap.from_list("skills", [COLORS[1], "#dcdcdc", COLORS[0]], 255)
+ONE_SKILL = COLORS[3]
 
 
 def extent(occupancy_map: OccupancyMap) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def draw_map(axes: Axes, occupancy_map: OccupancyMap) -> AxesImage:
 def draw_field(
     axes: Axes, occupancy_map: OccupancyMap, field: NDArray[np.float32], norm: Normalize
 ) -> AxesImage:
-    """Obstacles dark, places without a path to the goal grey, all others by their distance."""
+    """Obstacles dark, places without a path to the goal gray, all others by their distance."""
     look = extent(occupancy_map)
     cells = ListedColormap([UNREACHABLE, OBSTACLE])
     axes.imshow(occupancy_map.occupied, cmap=cells, vmin=0, vmax=1, **look)
@@ -73,12 +73,12 @@ def draw_scan(axes: Axes, episode: Episode, index: int) -> None:
     The robot's place closes the polygon where no beam looks, behind it.
     """
     corners = np.concatenate([episode.beam_ends(index), episode.poses[index, None, :2]])
-    colour = COLOURS[4]
-    axes.add_patch(Polygon(corners, fc=to_rgba(colour, 0.3), ec=colour, lw=1.0, zorder=2))
+    color = COLORS[4]
+    axes.add_patch(Polygon(corners, fc=to_rgba(color, 0.3), ec=color, lw=1.0, zorder=2))
 
 
 def draw_robot(axes: Axes, episode: Episode, index: int, *, size: float) -> None:
-    """An arrowhead of `size` m that points along the heading, centred on the robot."""
+    """An arrowhead of `size` m that points along the heading, centered on the robot."""
     axes.add_patch(arrowhead(episode.poses[index], size))
 
 
@@ -115,9 +115,9 @@ def mark_arrival(axes: Axes, episode: Episode) -> None:
 
 
 def draw_skill_path(axes: Axes, episode: Episode) -> LineCollection:
-    """The way from the start to the goal, each step in the colour of its skill decision.
+    """The way from the start to the goal, each step in the color of its skill decision.
 
-    With two skills the colour is the weight of the first against the second, with more the skill
+    With two skills the color is the weight of the first against the second, with more the skill
     of the largest weight, with one always the same. Start and goal are marked, and where an episode
     without success ended.
     """
@@ -131,7 +131,7 @@ def draw_skill_path(axes: Axes, episode: Episode) -> LineCollection:
     elif weights.shape[1] == 1:
         lines.set_color(ONE_SKILL)
     else:
-        lines.set_color([skill_colour(skill) for skill in weights.argmax(axis=1)])
+        lines.set_color([skill_color(skill) for skill in weights.argmax(axis=1)])
     axes.plot(*points.T, color=INK, lw=3.8, solid_capstyle="round", zorder=2.9)
     axes.add_collection(lines, autolim=False)
     draw_start(axes, episode)
@@ -141,13 +141,13 @@ def draw_skill_path(axes: Axes, episode: Episode) -> LineCollection:
     return lines
 
 
-def skill_colour(skill: int) -> str:
-    """The colour of a skill, counted from 0, in all pictures."""
-    return COLOURS[skill % len(COLOURS)]
+def skill_color(skill: int) -> str:
+    """The color of a skill, counted from 0, in all pictures."""
+    return COLORS[skill % len(COLORS)]
 
 
 def path_legend(episodes: Sequence[Episode]) -> list[Line2D | Patch]:
-    """What the marks of these episodes' paths mean; the scale of two skills is a colour bar's."""
+    """What the marks of these episodes' paths mean; the scale of two skills is a color bar's."""
     marks = [("start", "o", 5, "white", INK), ("goal", "*", 13, YELLOW, INK)]
     if not all(episode.success for episode in episodes):
         marks.append(("not reached", "x", 9, "none", RED))
@@ -160,7 +160,7 @@ def path_legend(episodes: Sequence[Episode]) -> list[Line2D | Patch]:
         handles.append(Line2D([], [], color=ONE_SKILL, lw=3, label="agent without skills"))
     if max(counts) > 2:
         handles += [
-            Line2D([], [], color=skill_colour(skill), lw=3, label=f"mostly skill {skill + 1}")
+            Line2D([], [], color=skill_color(skill), lw=3, label=f"mostly skill {skill + 1}")
             for skill in range(max(counts))
         ]
     return handles
@@ -178,7 +178,7 @@ def skill_bar(figure: Figure, axes: Sequence[Axes]) -> None:
 def scale_below(
     figure: Figure, scale: ScalarMappable, axes: Sequence[Axes], label: str
 ) -> Colorbar:
-    """A colour bar below panels; beside them it would take their width."""
+    """A color bar below panels; beside them it would take their width."""
     look: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45, "pad": 0.02}
     bar = figure.colorbar(scale, ax=list(axes), **look)
     bar.set_label(label, fontsize=9)

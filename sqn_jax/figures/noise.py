@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sqn_jax.figures.style import COLOURS, DPI, WIDTH_IN, plain, tidy
+from sqn_jax.figures.style import COLORS, DPI, WIDTH_IN, plain, tidy
 
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
@@ -46,7 +46,7 @@ def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
                 [entry[noise] for entry in entries],
                 mean,
                 yerr=[np.maximum(mean - low, 0), np.maximum(high - mean, 0)],
-                color=COLOURS[number % len(COLOURS)],
+                color=COLORS[number % len(COLORS)],
                 marker=_MARKERS[number % len(_MARKERS)],
                 capsize=3,
                 label=plain(agent),

@@ -16,15 +16,15 @@ from matplotlib.patches import Circle, Patch
 from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.figures.ground import RED, UNREACHABLE, YELLOW, draw_cross, draw_field
-from sqn_jax.figures.style import COLOURS, DPI, INK, OBSTACLE, WIDTH_IN, plain
+from sqn_jax.figures.style import COLORS, DPI, INK, OBSTACLE, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
 Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in one panel; more would hide each other
 
-# From skill 2, orange, over violet to skill 1, dark blue, their colours in all pictures; darker all
-# along, so that it survives greyscale.
+# From skill 2, orange, over violet to skill 1, dark blue, their colors in all pictures; darker all
+# along, so that it survives grayscale.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
@@ -53,7 +53,7 @@ def trajectories(
     """Draw the paths of E episodes over the distance field of their goals, a panel for each goal.
 
     A path ends where it first enters the goal radius; without success it is drawn whole and ends in
-    a cross. Its colour is the weight of the first skill in each step. A panel draws at most
+    a cross. Its color is the weight of the first skill in each step. A panel draws at most
     `MAX_PATHS` paths, failures first (they get half of the places, more if there are not enough
     successes), successes evenly from the quickest to the slowest. The title counts all episodes;
     its steps are the mean over those that reached the goal.
@@ -65,7 +65,7 @@ def trajectories(
         occupancy_map: the map the episodes ran on.
         goals: [E, 2] x, y in the grid frame, m; equal within 1e-6 m means the same goal.
         poses: [T + 1, E, 3] x m, y m, heading rad; the first is the start.
-        skill_weights: [T, E, K] the skill decision of each step, 0..1; K = 1 gives one colour.
+        skill_weights: [T, E, K] the skill decision of each step, 0..1; K = 1 gives one color.
         success: [E] bool, the goal was reached.
         time_steps: [E] int, the step of the first entry, counted from 1; not read for failures.
         goal_radius: m.
@@ -91,8 +91,8 @@ def trajectories(
         image = draw_field(axes, occupancy_map, field, norm)
         for episode in _chosen_episodes(panel):
             end = int(steps[episode]) if success[episode] else length
-            colours = weights[:end, episode, 0] if skills > 1 else None
-            _draw_path(axes, poses[: end + 1, episode], colours, reached=bool(success[episode]))
+            colors = weights[:end, episode, 0] if skills > 1 else None
+            _draw_path(axes, poses[: end + 1, episode], colors, reached=bool(success[episode]))
         _draw_goal(axes, panel, steps, goal_radius)
     figure.colorbar(image, ax=grid, label="distance to the goal, m", aspect=35, pad=0.02)
     if skills > 1:
@@ -183,13 +183,13 @@ def _panel_grid(occupancy_map: OccupancyMap, count: int) -> tuple[Figure, list[A
 
 
 def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bool) -> None:
-    """One path [S + 1, 3] coloured by the weights [S] of its steps, with its start and its end."""
+    """One path [S + 1, 3] colored by the weights [S] of its steps, with its start and its end."""
     points = poses[:, :2]
     segments = list(np.stack([points[:-1], points[1:]], axis=1))
     width, order = (2.0, 3) if reached else (1.4, 2)
     lines = LineCollection(segments, linewidths=width, capstyle="round", zorder=order)
     if weights is None:
-        lines.set_color(COLOURS[0])
+        lines.set_color(COLORS[0])
     else:
         lines.set(array=weights, cmap=_WEIGHT_MAP, norm=Normalize(0.0, 1.0))
     axes.add_collection(lines, autolim=False)

@@ -26,9 +26,9 @@ from sqn_jax.figures.ground import (
     SKILL_MAP,
     YELLOW,
     arrowhead,
-    skill_colour,
+    skill_color,
 )
-from sqn_jax.figures.style import COLOURS, INK, OBSTACLE, tidy
+from sqn_jax.figures.style import COLORS, INK, OBSTACLE, tidy
 
 WIDTH, HEIGHT = 800, 580
 """The frame that all places below are measured in, pixels; others are that frame scaled."""
@@ -42,23 +42,23 @@ REWARD_BOX = (574, 418, 214, 116)
 AFTER_ARRIVAL = 2.0
 """How long the film goes on after the arrival, s of the episode."""
 
-ROBOT = COLOURS[5]
+ROBOT = COLORS[5]
 ROBOT_PX = 19
-SCAN = COLOURS[4]
+SCAN = COLORS[4]
 REACHED = "#00704f"
-REWARD_LINES = (("navigation", COLOURS[2], "-"), ("exploration", COLOURS[5], "--"))
+REWARD_LINES = (("navigation", COLORS[2], "-"), ("exploration", COLORS[5], "--"))
 TIME_LINE = ("time", "#777777", "-.")
 
-KEY_COLOURS = (
+KEY_COLORS = (
     *("#ffffff", FREE, SEEN, OBSTACLE, INK, ROBOT, SCAN, YELLOW, RED, REACHED, ONE_SKILL),
-    *COLOURS,
+    *COLORS,
 )
-"""What must keep its colour in a palette."""
+"""What must keep its color in a palette."""
 
 
-def rgb(colour: str) -> NDArray[np.uint8]:
+def rgb(color: str) -> NDArray[np.uint8]:
     """[3] uint8."""
-    return np.rint(255 * np.array(to_rgb(colour))).astype(np.uint8)
+    return np.rint(255 * np.array(to_rgb(color))).astype(np.uint8)
 
 
 def last_step(episode: Episode) -> int:
@@ -69,14 +69,14 @@ def last_step(episode: Episode) -> int:
     return min(episode.num_steps, episode.time_steps + after)
 
 
-def _path_colours(weights: NDArray[np.floating]) -> NDArray[np.floating]:
+def _path_colors(weights: NDArray[np.floating]) -> NDArray[np.floating]:
     """RGBA [T, 4] of the steps of a path from their skill decisions [T, K]."""
     skills = weights.shape[1]
     if skills == 1:
         return np.tile(to_rgba_array(ONE_SKILL), (len(weights), 1))
     if skills == 2:
         return np.asarray(SKILL_MAP(weights[:, 0].astype(np.float64)))
-    return to_rgba_array([skill_colour(int(skill)) for skill in weights.argmax(axis=1)])
+    return to_rgba_array([skill_color(int(skill)) for skill in weights.argmax(axis=1)])
 
 
 class Screen:
@@ -130,9 +130,9 @@ class Screen:
         episode = self.episode
         width, height = episode.occupancy_map.size_m
         left, top, box, _ = (round(value * self._scale) for value in MAP_BOX)
-        self.pixels_per_metre = box / max(width, height)
-        columns = max(round(width * self.pixels_per_metre), 1)
-        rows = max(round(height * self.pixels_per_metre), 1)
+        self.pixels_per_meter = box / max(width, height)
+        columns = max(round(width * self.pixels_per_meter), 1)
+        rows = max(round(height * self.pixels_per_meter), 1)
         self.map_corner = (top + (box - rows) // 2, left + (box - columns) // 2)
         place = (self.map_corner[1], self.map_corner[0], columns, rows)
         axes = self._axes(place, scaled=False)
@@ -151,7 +151,7 @@ class Screen:
         self._edge = self._add(axes, axes.plot([], [], color=INK, lw=3.6, **look)[0])
         pairs = np.stack([self._points[:-1], self._points[1:]], axis=1)
         self._pieces = [Path(pair) for pair in pairs]
-        self._colours: Any = _path_colours(episode.skill_weights)
+        self._colors: Any = _path_colors(episode.skill_weights)
         self._path = PathCollection([], linewidths=2.4, capstyle="round", facecolors="none")
         axes.add_collection(self._path, autolim=False)
         self._add(axes, self._path)
@@ -162,7 +162,7 @@ class Screen:
         self._add(axes, axes.add_patch(circle))
         self._add(axes, axes.plot(*goal, "*", ms=12, mfc=YELLOW, mec=INK, mew=1.0)[0])
         self._arrow_m = max(
-            ROBOT_PX * self._scale / self.pixels_per_metre, 3 * episode.robot_radius
+            ROBOT_PX * self._scale / self.pixels_per_meter, 3 * episode.robot_radius
         )
         robot = arrowhead(episode.poses[0], self._arrow_m)
         robot.set(fc=ROBOT, ec=INK, lw=1.0)
@@ -195,11 +195,11 @@ class Screen:
         return mask
 
     def _draw_legend(self, place: tuple[int, int, int, int]) -> None:
-        """Below the map: how long a metre is, and what the marks mean."""
-        longest = 80 * self._scale / self.pixels_per_metre
+        """Below the map: how long a meter is, and what the marks mean."""
+        longest = 80 * self._scale / self.pixels_per_meter
         length = max((m for m in (0.5, 1, 2, 5, 10, 20, 50, 100) if m <= longest), default=0.2)
         left, bottom = place[0], place[1] + place[3]
-        x = np.array([left, left + length * self.pixels_per_metre]) / self._size[1]
+        x = np.array([left, left + length * self.pixels_per_meter]) / self._size[1]
         y = 1 - (bottom + 12 * self._scale) / self._size[0]
         self.figure.add_artist(Line2D(x, [y, y], color=INK, lw=2, solid_capstyle="butt"))
         self.figure.text(x.mean(), y - 0.012, f"{length:g} m", ha="center", va="top", fontsize=8)
@@ -210,11 +210,11 @@ class Screen:
         ]
         handles.append(Patch(fc=SEEN, ec="0.6", lw=0.5, label="seen"))
         handles.append(Patch(fc=(*to_rgb(SCAN), 0.35), ec=SCAN, label="scan"))
-        # With more than two skills the numbers above their bar have the colours.
-        named = {1: [("path", ONE_SKILL)], 2: [(f"skill {k + 1}", skill_colour(k)) for k in (0, 1)]}
+        # With more than two skills the numbers above their bar have the colors.
+        named = {1: [("path", ONE_SKILL)], 2: [(f"skill {k + 1}", skill_color(k)) for k in (0, 1)]}
         handles += [
-            Line2D([], [], color=colour, lw=3, label=name)
-            for name, colour in named.get(self.episode.skill_weights.shape[1], [])
+            Line2D([], [], color=color, lw=3, label=name)
+            for name, color in named.get(self.episode.skill_weights.shape[1], [])
         ]
         right = (MAP_BOX[0] + MAP_BOX[2]) / WIDTH
         look: dict[str, Any] = {"frameon": False, "columnspacing": 1.1, "handletextpad": 0.4}
@@ -230,7 +230,7 @@ class Screen:
         self._scan.set_xy(corners)
         self._edge.set_data(*self._points[: index + 1].T)
         self._path.set_paths(self._pieces[:index])
-        self._path.set_edgecolor(self._colours[:index])
+        self._path.set_edgecolor(self._colors[:index])
         self._robot.set_xy(arrowhead(episode.poses[index], self._arrow_m).get_xy())
 
     # ----------------------------------------------------------------------------- the robot's view
@@ -276,12 +276,12 @@ class Screen:
         axes = self._axes(SKILL_BOX)
         axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[])
         for skill in range(skills):
-            bar = Rectangle((0, 0), 0, 1, fc=skill_colour(skill), ec="white", lw=0.5)
+            bar = Rectangle((0, 0), 0, 1, fc=skill_color(skill), ec="white", lw=0.5)
             axes.add_patch(bar)
             self._bars.append(self._add(axes, bar))
             place = ((skill + 0.5) / skills, 1.25)
             text = axes.text(*place, "", ha="center", va="bottom", fontsize=9, weight="bold")
-            text.set_color(skill_colour(skill))
+            text.set_color(skill_color(skill))
             self._weights.append(self._add(axes, text))
 
     def _update_skills(self, index: int) -> None:
@@ -310,8 +310,8 @@ class Screen:
         axes.tick_params(labelsize=8, length=2, pad=2)
         axes.locator_params(nbins=5)
         lines = []
-        for name, colour, style in (*REWARD_LINES, TIME_LINE):
-            line = axes.plot([], [], color=colour, ls=style, lw=1.8, label=name)[0]
+        for name, color, style in (*REWARD_LINES, TIME_LINE):
+            line = axes.plot([], [], color=color, ls=style, lw=1.8, label=name)[0]
             lines.append(self._add(axes, line))
         self._reward_lines = lines
         self._heading(SKILL_BOX, "reward so far, weighted", above=-48)
@@ -347,14 +347,14 @@ class Screen:
         away = math.dist(episode.poses[index, :2], episode.goal)
         told = [f"step {index} of {episode.num_steps}", f"{index * episode.time_step:.1f} s"]
         told.append(f"{away:.1f} m to the goal")
-        colour = INK
+        color = INK
         if episode.success and index >= episode.time_steps:
             told.append(f"reached at step {episode.time_steps}")
-            colour = REACHED
+            color = REACHED
         elif index == episode.num_steps:
             told.append("not reached")
-            colour = RED
-        self._words.set(text="   ".join(told), color=colour)
+            color = RED
+        self._words.set(text="   ".join(told), color=color)
 
     # ------------------------------------------------------------------------------------- helpers
 

@@ -1,4 +1,4 @@
-"""Which skill drove where: paths in the colours of the skill decision, agents side by side."""
+"""Which skill drove where: paths in the colors of the skill decision, agents side by side."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit a page
 
 
 def skill_trajectories(episodes: Sequence[Episode], *, title: str) -> Figure:
-    """Draw paths over the map in the colours of the skill decision, a panel for each map.
+    """Draw paths over the map in the colors of the skill decision, a panel for each map.
 
-    With two skills the colour runs from vermillion (skill 2 alone) over grey to blue (skill 1
-    alone); with more a step has the colour of the skill of the largest weight; agents without
-    skills have one colour. A path ends where it first enters the goal radius; without success it is
+    With two skills the color runs from vermillion (skill 2 alone) over gray to blue (skill 1
+    alone); with more a step has the color of the skill of the largest weight; agents without
+    skills have one color. A path ends where it first enters the goal radius; without success it is
     drawn whole and ends in a cross.
 
     Args:
@@ -67,7 +67,7 @@ def agents_side_by_side(
 ) -> Figure:
     """Draw the same tasks driven by several agents: a row for each task, a column for each agent.
 
-    The ground is the true distance to the goal; paths have the colours of `skill_trajectories`.
+    The ground is the true distance to the goal; paths have the colors of `skill_trajectories`.
 
     Args:
         episodes_by_agent: for each agent its episodes, at most 4, all on one map; starts and goals

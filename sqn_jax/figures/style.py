@@ -1,4 +1,4 @@
-"""What the figures have in common: size, colours, axes, and how they are written."""
+"""What the figures have in common: size, colors, axes, and how they are written."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sqn_jax.storage.files import written_whole
 DPI = 160
 WIDTH_IN = 9.0
 
-# Okabe and Ito's colours, told apart under every common colour blindness; no yellow on white.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+# Okabe and Ito's colors, told apart under every common color blindness; no yellow on white.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 INK, OBSTACLE = "#222222", "#333a42"
 
 

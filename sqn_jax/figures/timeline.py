@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sqn_jax.evaluation.recording import Episode
-from sqn_jax.figures.ground import mark_arrival, skill_colour
-from sqn_jax.figures.style import COLOURS, DPI, INK, WIDTH_IN, plain, tidy
+from sqn_jax.figures.ground import mark_arrival, skill_color
+from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 
 _REWARD_PARTS = ("navigation", "exploration", "time")
-_PART_STYLES = ((COLOURS[2], "-"), (COLOURS[5], "--"), ("#7a7a7a", "-."))
+_PART_STYLES = ((COLORS[2], "-"), (COLORS[5], "--"), ("#7a7a7a", "-."))
 
 
 def episode_timeline(episode: Episode, *, title: str) -> Figure:
@@ -64,7 +64,7 @@ def _draw_weights(axes: Axes, episode: Episode) -> None:
     tops = np.cumsum(weights, axis=1)
     for skill in range(weights.shape[1]):
         low, high = tops[:, skill] - weights[:, skill], tops[:, skill]
-        look: dict[str, Any] = {"color": skill_colour(skill), "label": f"skill {skill + 1}"}
+        look: dict[str, Any] = {"color": skill_color(skill), "label": f"skill {skill + 1}"}
         axes.fill_between(edges, low, high, step="post", alpha=0.8, lw=0, **look)
     axes.set(ylim=(0, 1), ylabel="skill weight", axisbelow=True)
 
@@ -75,7 +75,7 @@ def _draw_values(axes: Axes, episode: Episode) -> None:
     best = episode.skill_q_values.max(axis=2)
     if best.shape[1] > 1:
         for skill, values in enumerate(best.T):
-            axes.plot(times, values, color=skill_colour(skill), lw=1.3, label=f"skill {skill + 1}")
+            axes.plot(times, values, color=skill_color(skill), lw=1.3, label=f"skill {skill + 1}")
     name = "ensemble" if best.shape[1] > 1 else "Q-value"
     axes.plot(times, episode.q_values.max(axis=1), color=INK, lw=1.3, label=name)
     axes.set_ylabel("Q-value,\nbest action")
@@ -85,8 +85,8 @@ def _draw_rewards(axes: Axes, episode: Episode) -> None:
     """The running sums of the weighted parts of the reward, and of the reward."""
     times = np.arange(episode.num_steps + 1) * episode.time_step
     sums = np.cumsum(np.concatenate([np.zeros((1, 3)), episode.reward_parts]), axis=0)
-    for values, name, (colour, style) in zip(sums.T, _REWARD_PARTS, _PART_STYLES, strict=True):
-        axes.plot(times, values, color=colour, ls=style, lw=1.8, label=name)
+    for values, name, (color, style) in zip(sums.T, _REWARD_PARTS, _PART_STYLES, strict=True):
+        axes.plot(times, values, color=color, ls=style, lw=1.8, label=name)
     axes.plot(times, sums.sum(axis=1), color=INK, lw=1.2, label="reward")
     axes.set_ylabel("reward\nup to here")
 
@@ -100,14 +100,14 @@ def _draw_distance(axes: Axes, episode: Episode) -> None:
     if episode.reachable.any():
         # What is known after a step holds until after the next.
         shade = np.where(np.concatenate([[False], episode.reachable]), high, 0.0)
-        look: dict[str, Any] = {"step": "post", "color": COLOURS[2], "alpha": 0.25, "lw": 0}
+        look: dict[str, Any] = {"step": "post", "color": COLORS[2], "alpha": 0.25, "lw": 0}
         axes.fill_between(times, 0, shade, label="goal reachable", **look)
-    axes.plot(times, distances, color=COLOURS[0], lw=1.8, label="distance")
+    axes.plot(times, distances, color=COLORS[0], lw=1.8, label="distance")
     axes.axhline(episode.goal_radius, color="0.45", lw=0.9, ls="--", label="goal radius")
     if episode.collisions.any():
         refused = times[1:][episode.collisions]
         bottom = np.full(refused.shape, 0.03 * high)
-        axes.plot(refused, bottom, "|", color=COLOURS[1], ms=9, mew=1.3, label="move refused")
+        axes.plot(refused, bottom, "|", color=COLORS[1], ms=9, mew=1.3, label="move refused")
     if episode.success:
         axes.plot([], [], color=INK, ls=":", lw=1.4, label="goal radius entered")
     axes.set(ylim=(0, high), ylabel="to the goal, m")

@@ -1,7 +1,7 @@
-"""A report on trained policies: one page that needs nothing beside it, neither files nor a network.
+"""A report on trained policies: one page that needs no other files and no network.
 
-`content` drives and gathers, `episodes` finds those that went worst and where, `pictures` draws,
-`page` puts it into HTML.
+`content` runs the evaluation, `episodes` ranks the episodes and finds where robots got stuck,
+`pictures` draws, `page` writes HTML.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sqn_jax.evaluation.compare import Settings
-from sqn_jax.report.content import Run, gather, read_runs
-from sqn_jax.report.page import require_writable, to_html, write
-from sqn_jax.report.pictures import draw
+from sqn_jax.evaluation.settings import Settings
+from sqn_jax.report.content import Run, gather_content, read_runs
+from sqn_jax.report.page import require_writable, to_html, write_page
+from sqn_jax.report.pictures import draw_pictures
 from sqn_jax.storage.compile_cache import cached_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
@@ -20,19 +20,19 @@ __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 
 @cached_programs()
 def write_report(
-    runs: Sequence[Run], settings: Settings, out: Path, *, references: bool = True
+    runs: Sequence[Run], settings: Settings, out: Path, *, baselines: bool = True
 ) -> None:
-    """Evaluate runs under a progress bar and write a page about them.
+    """Evaluate runs with a progress bar and write a page about them.
 
     Args:
         runs: from `read_runs`, at least one.
-        settings: where and how often; the first goal radius is the one reported.
-        out: an HTML file, replaced where it is there.
-        references: whether an oracle and a wall follower drive too.
+        settings: of the evaluation; the report is for the first goal radius.
+        out: the HTML file; an existing one is replaced.
+        baselines: whether to evaluate the oracle and the wall follower too.
 
     Raises:
         ValueError: a map is unusable for a robot, runs cannot be told apart, or the file cannot be
             written.
     """
-    content = gather(runs, settings, references=references)
-    write(out, to_html(content, draw(content)))
+    content = gather_content(runs, settings, baselines=baselines)
+    write_page(out, to_html(content, draw_pictures(content)))

@@ -1,4 +1,4 @@
-"""The episodes that went worst, and the places where they did."""
+"""The worst episodes of an evaluation, and the places where robots got stuck in them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
-from sqn_jax.evaluation.compare import EpisodeBatch, World
+from sqn_jax.evaluation.agents import EpisodeBatch
+from sqn_jax.evaluation.settings import World
 
 Floats = NDArray[np.floating]
 
 NEAR = 1.0
-"""m; how far around a place a robot counts as being there."""
+"""m; a robot is at a place if it is within this distance."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Place:
     steps: int
     """Steps that ended within `NEAR` of it."""
     of: int
-    """The steps that were looked at, the last ones of the episode."""
+    """Number of steps considered: the last ones of the episode."""
 
     @property
     def is_most(self) -> bool:
@@ -37,18 +38,18 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class HardEpisode:
-    """One episode that went badly."""
+class WorstEpisode:
+    """One of the worst episodes."""
 
     batch: EpisodeBatch
     episode: int
-    """Which of the batch's."""
-    way: float
-    """m, the shortest way from start to goal."""
-    left: float
-    """m, the shortest way from where the robot ended to the goal; 0 for a success."""
+    """Index in the batch."""
+    shortest_path: float
+    """m, from start to goal."""
+    remaining_path: float
+    """m, shortest path from the last pose to the goal; 0 for a success."""
     place: Place
-    """Of a failure in the last half of the episode, of a success up to its goal."""
+    """In the second half of a failure; in a success up to the goal."""
 
     @property
     def success(self) -> bool:
@@ -61,49 +62,49 @@ class HardEpisode:
 
     @property
     def refused(self) -> int:
-        """Moves refused within these steps."""
+        """Number of moves refused within these steps."""
         return int(self.batch.trajectory.info["collision"][: self.steps, self.episode].sum())
 
     @property
     def slowness(self) -> float:
-        """Steps, as a multiple of those that the shortest way takes at full speed."""
-        return self.steps / _fewest_steps(self.batch, self.way)
+        """Steps divided by those that the shortest path takes at full speed."""
+        return self.steps / _fewest_steps(self.batch, self.shortest_path)
 
 
 def densest_place(points: Floats) -> Place:
-    """The point with most points within `NEAR` of it; among equals the one they are nearest to.
+    """The point with most points within `NEAR` of it; of equals the one they are nearest to.
 
     Args:
         points: [N, 2] x m, y m, at least one.
     """
     best = (0, 0.0)
     densest = points[0]
-    # A robot that stands still has many points and one place.
+    # A robot that stands still has many equal points.
     for point in np.unique(points, axis=0):
-        away = np.hypot(*(points - point).T)
-        near = away[away <= NEAR]
+        distances = np.hypot(*(points - point).T)
+        near = distances[distances <= NEAR]
         rank = (near.size, -float(near.sum()))
         if rank > best:
             best, densest = rank, point
     return Place(float(densest[0]), float(densest[1]), best[0], len(points))
 
 
-def hardest(batches: Sequence[EpisodeBatch], count: int = 3) -> list[HardEpisode]:
-    """The episodes that went worst, the worst first.
+def worst_episodes(batches: Sequence[EpisodeBatch], count: int = 3) -> list[WorstEpisode]:
+    """The worst episodes, the worst first.
 
-    Failures come before successes: those with the longest way left over the map first. If they are
-    too few, the successes that were slowest beside their shortest way follow.
+    Failures come first, those with the longest remaining path to the goal at the front. If they are
+    too few, successes follow, those slowest relative to their shortest path at the front.
 
     Args:
-        batches: all episodes, their trajectories with `info`.
-        count: at most so many.
+        batches: all episodes; the trajectories need `info`.
+        count: the largest number of episodes.
     """
-    found: list[HardEpisode] = []
+    worst: list[WorstEpisode] = []
     for success in (False, True):
-        if len(found) < count:
+        if len(worst) < count:
             ranked = _ranked(batches, success=success)
-            found += [_looked_at(*each) for each in ranked[: count - len(found)]]
-    return found
+            worst += [_worst_episode(*item) for item in ranked[: count - len(worst)]]
+    return worst
 
 
 def _ranked(batches: Sequence[EpisodeBatch], *, success: bool) -> list[tuple[EpisodeBatch, int]]:
@@ -111,46 +112,45 @@ def _ranked(batches: Sequence[EpisodeBatch], *, success: bool) -> list[tuple[Epi
     ranks: list[tuple[float, int, int]] = []
     numbered = list(enumerate(batches))
     for world in {id(batch.world): batch.world for batch in batches}.values():
-        # Together, since agents have goals in common and a distance field takes its time.
-        same = [(number, batch) for number, batch in numbered if batch.world is world]
+        # All agents together: they have the same goals, and a distance field takes time.
+        in_world = [(number, batch) for number, batch in numbered if batch.world is world]
         chosen = [
             (number, episode)
-            for number, batch in same
+            for number, batch in in_world
             for episode in np.flatnonzero(np.asarray(batch.main_metrics.success) == success)
         ]
         if not chosen:
             continue
-        moment = 0 if success else -1
-        places = np.stack([batches[n].trajectory.poses[moment, episode] for n, episode in chosen])
+        step = 0 if success else -1
+        poses = np.stack([batches[n].trajectory.poses[step, episode] for n, episode in chosen])
         goals = np.stack([batches[number].goals[episode] for number, episode in chosen])
-        ways = _ways(world, places, goals)
-        for (number, episode), way in zip(chosen, ways, strict=True):
+        paths = _shortest_paths(world, poses, goals)
+        for (number, episode), path in zip(chosen, paths, strict=True):
             batch = batches[number]
             steps = float(batch.main_metrics.time_steps[episode])
-            badness = steps / _fewest_steps(batch, way) if success else float(way)
+            badness = steps / _fewest_steps(batch, path) if success else float(path)
             ranks.append((-badness, number, int(episode)))
     return [(batches[number], episode) for _, number, episode in sorted(ranks)]
 
 
-def _looked_at(batch: EpisodeBatch, episode: int) -> HardEpisode:
+def _worst_episode(batch: EpisodeBatch, episode: int) -> WorstEpisode:
     success = bool(batch.main_metrics.success[episode])
     steps = int(batch.main_metrics.time_steps[episode])
     poses = batch.trajectory.poses[:, episode]
     first = 0 if success else steps // 2
     goals = batch.goals[[episode, episode]]
-    way, left = (float(length) for length in _ways(batch.world, poses[[0, -1]], goals))
+    shortest, remaining = _shortest_paths(batch.world, poses[[0, -1]], goals).tolist()
     place = densest_place(poses[first + 1 : steps + 1, :2])
-    return HardEpisode(batch, episode, way, 0.0 if success else left, place)
+    return WorstEpisode(batch, episode, shortest, 0.0 if success else remaining, place)
 
 
-def _ways(
-    world: World, places: NDArray[np.floating], goals: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def _shortest_paths(world: World, poses: Floats, goals: Floats) -> NDArray[np.float64]:
+    """[N] m from poses [N, 3] to goals [N, 2]."""
     robot_radius = world.env_params.config.robot_radius
-    return shortest_path_lengths(world.occupancy_map, places, goals, robot_radius=robot_radius)
+    return shortest_path_lengths(world.occupancy_map, poses, goals, robot_radius=robot_radius)
 
 
-def _fewest_steps(batch: EpisodeBatch, way: float) -> float:
-    """Steps that a way takes at full speed; at least one."""
+def _fewest_steps(batch: EpisodeBatch, path_length: float) -> float:
+    """Steps that a path of this length, m, takes at full speed; at least one."""
     config = batch.world.env_params.config
-    return max(1.0, way / (config.forward_speed * config.time_step))
+    return max(1.0, path_length / (config.forward_speed * config.time_step))

@@ -1,4 +1,4 @@
-"""The page: semantic HTML with its style and pictures inside, and nothing that it would fetch."""
+"""The page: semantic HTML with its style and pictures inside; it fetches nothing."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 
 from sqn_jax import config as configs
 from sqn_jax.config.presets import PAPER_MAPS
-from sqn_jax.evaluation.compare import Settings
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Content, Run, changed_settings
-from sqn_jax.report.episodes import NEAR, HardEpisode
+from sqn_jax.report.episodes import NEAR, WorstEpisode
 from sqn_jax.report.pictures import Illustration, Illustrations
 from sqn_jax.storage.files import probe_writable, written_whole
 from sqn_jax.storage.run_folder import CONFIG
 
-_REFERENCES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
+_BASELINE_NAMES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -60,10 +60,10 @@ summary { cursor: pointer; margin: .6rem 0; }
 
 
 def require_writable(path: Path) -> None:
-    """Refuse a file that could not be written, before anything is driven.
+    """Refuse a file that could not be written, before any episode runs.
 
     Raises:
-        ValueError: the name does not end in .html, or there is no place for such a file.
+        ValueError: the name does not end in .html, or the file cannot be written.
     """
     if path.suffix != ".html":
         raise ValueError(f"--out is {path}, expected a file ending in .html")
@@ -75,8 +75,8 @@ def require_writable(path: Path) -> None:
         raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
 
 
-def write(path: Path, html: str) -> None:
-    """Write a page as a whole or not at all.
+def write_page(path: Path, html: str) -> None:
+    """Write a page, all or nothing.
 
     Raises:
         ValueError: it cannot be written.
@@ -91,8 +91,8 @@ def to_html(content: Content, pictures: Illustrations) -> str:
     sections = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(lead(content))}</p>',
-        f'<p class="note">{escape(_how(content.settings))}</p>',
-        *_hardest(content.hardest, pictures.hardest),
+        f'<p class="note">{escape(_protocol(content.settings))}</p>',
+        *_worst(content.worst, pictures.worst),
         "<h2>Success and time steps</h2>",
         success_table(content.evaluation["results"], content.settings),
         *_training(content, pictures),
@@ -129,30 +129,30 @@ def to_html(content: Content, pictures: Illustrations) -> str:
 
 
 def lead(content: Content) -> str:
-    """One sentence of what it came to."""
+    """One sentence with the result of each agent."""
     parts = []
     for agent in content.agents:
-        told = [
+        results = [
             f"{entry['success']['mean']:.2f} on {_world(entry, content.settings)} "
             f"({entry['time_steps']['mean']:,.0f} steps)"
             for entry in content.evaluation["results"]
             if entry["agent"] == agent.name
         ]
-        parts.append(f"{agent.name} has success {_listed(told)}")
+        parts.append(f"{agent.name} has success {_listed(results)}")
     return "; ".join(parts) + "."
 
 
-def _listed(words: Sequence[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+def _listed(items: Sequence[str]) -> str:
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
 def _world(entry: dict[str, Any], settings: Settings) -> str:
-    """The map, and the tasks too where there are two kinds of them."""
+    """The map, and also the tasks if there are two kinds of them."""
     name = str(entry["map"])
     return name if len(settings.tasks) == 1 else f"{name}, {entry['tasks']}"
 
 
-def _how(settings: Settings) -> str:
+def _protocol(settings: Settings) -> str:
     seeds = f"evaluation seed {settings.seed}"
     if settings.eval_seeds > 1:
         last = settings.seed + settings.eval_seeds - 1
@@ -163,93 +163,94 @@ def _how(settings: Settings) -> str:
     }
     return (
         f"{settings.episodes:,} greedy episodes of each trained seed under {seeds}, "
-        f"{' and '.join(tasks[word] for word in settings.tasks)}; the goal counts as reached "
+        f"{' and '.join(tasks[kind] for kind in settings.tasks)}; the goal counts as reached "
         f"within {settings.goal_radii[0]:g} m of it, and a failure counts as many time steps as "
         "an episode has."
     )
 
 
-def _hardest(hardest: Sequence[HardEpisode], pictures: Sequence[Illustration]) -> Iterable[str]:
-    failures = sum(not hard.success for hard in hardest)
-    yield "<h2>What went worst</h2>"
-    if failures == len(hardest):
-        rule = "The failures that ended with the longest way left to the goal."
+def _worst(episodes: Sequence[WorstEpisode], pictures: Sequence[Illustration]) -> Iterable[str]:
+    failures = sum(not worst.success for worst in episodes)
+    yield "<h2>Worst episodes</h2>"
+    if failures == len(episodes):
+        rule = "The failures that ended farthest from the goal, along the shortest path."
     elif failures:
-        rule = "All failures, and the successes that were slowest beside their shortest way."
+        rule = "All failures, then the slowest successes relative to their shortest paths."
     else:
-        rule = "No episode failed: the successes that were slowest beside their shortest way."
+        rule = "No episode failed: the slowest successes relative to their shortest paths."
     yield f'<p class="note">{rule}</p>'
-    for number, (hard, picture) in enumerate(zip(hardest, pictures, strict=True), start=1):
-        heading = f"{number}. {hard.batch.world.occupancy_map.name}: {_in_short(hard)}"
+    for number, (worst, picture) in enumerate(zip(episodes, pictures, strict=True), start=1):
+        heading = f"{number}. {worst.batch.world.occupancy_map.name}: {_outcome(worst)}"
         yield '<section class="hard">'
         yield f"<h3>{escape(heading)}</h3>"
-        yield f"<p>{escape(words(hard))}</p>"
+        yield f"<p>{escape(describe_episode(worst))}</p>"
         yield _figure(picture)
         yield "</section>"
 
 
-def _in_short(hard: HardEpisode) -> str:
-    if hard.success:
-        return f"reached, in {hard.slowness:.1f} times the steps of the shortest way"
-    return f"{_metres(hard.left)} of way left"
+def _outcome(worst: WorstEpisode) -> str:
+    if worst.success:
+        return f"reached, in {worst.slowness:.1f} times the steps of the shortest path"
+    return f"not reached, {_meters(worst.remaining_path)} left"
 
 
-def _metres(length: float) -> str:
-    return f"{length:.1f} m" if np.isfinite(length) else "no end"
+def _meters(length: float) -> str:
+    return f"{length:.1f} m" if np.isfinite(length) else "∞ m"
 
 
-def words(hard: HardEpisode) -> str:
+def describe_episode(worst: WorstEpisode) -> str:
     """What happened in an episode, with numbers."""
-    batch, place = hard.batch, hard.place
-    start, goal = batch.starts[hard.episode], batch.goals[hard.episode]
-    there = f"within {NEAR:g} m of ({place.x:.1f}, {place.y:.1f}) m"
-    share = f"{place.steps:,} of the last {place.of:,} steps"
-    if hard.success:
-        end = (
-            f"The goal was reached after {hard.steps:,} steps, {hard.slowness:.1f} times as many "
-            f"as the shortest way of {_metres(hard.way)} takes at full speed. Of these steps "
-            f"{place.steps:,} were spent {there}."
+    batch, place = worst.batch, worst.place
+    start, goal = batch.starts[worst.episode], batch.goals[worst.episode]
+    where = f"within {NEAR:g} m of ({place.x:.1f}, {place.y:.1f}) m"
+    steps = f"{place.steps:,} of the last {place.of:,} steps"
+    if worst.success:
+        outcome = (
+            f"The goal was reached after {worst.steps:,} steps, {worst.slowness:.1f} times as many "
+            f"as the shortest path of {_meters(worst.shortest_path)} takes at full speed. Of these "
+            f"steps {place.steps:,} were spent {where}."
         )
     else:
-        stuck = f"The robot got stuck: it spent {share} {there}."
+        stuck = f"The robot got stuck: it spent {steps} {where}."
         if not place.is_most:
-            stuck = f"The robot got stuck nowhere for long: at most it spent {share} {there}."
-        end = (
-            f"The goal was not reached within {hard.steps:,} steps. {stuck} {_metres(hard.left)} "
-            f"of way were left, of {_metres(hard.way)} from the start."
+            stuck = f"The robot got stuck nowhere for long: at most it spent {steps} {where}."
+        outcome = (
+            f"The goal was not reached within {worst.steps:,} steps. {stuck} "
+            f"The shortest path to the goal was {_meters(worst.shortest_path)} from the start and "
+            f"{_meters(worst.remaining_path)} from the end."
         )
-    moves = {0: "No move was", 1: "1 move was"}.get(hard.refused, f"{hard.refused:,} moves were")
+    moves = {0: "No move was", 1: "1 move was"}.get(worst.refused, f"{worst.refused:,} moves were")
     return (
         f"{batch.agent.name}, training seed {batch.training_seed}, on "
         f"{batch.world.occupancy_map.name} "
-        f"({batch.world.tasks}, episode {hard.episode} of evaluation seed {batch.eval_seed}): "
+        f"({batch.world.tasks}, episode {worst.episode} of evaluation seed {batch.eval_seed}): "
         f"from ({start[0]:.1f}, {start[1]:.1f}) m to the goal at ({goal[0]:.1f}, {goal[1]:.1f}) m. "
-        f"{end} {moves} refused."
+        f"{outcome} {moves} refused."
     )
 
 
 def success_table(results: Sequence[dict[str, Any]], settings: Settings) -> str:
-    """Success and time steps: agents, references and the paper below each other, maps across."""
+    """Success and time steps: a row for each agent, baseline and paper result; maps across."""
     worlds = list(dict.fromkeys((entry["map"], entry["tasks"]) for entry in results))
     agents = {entry["agent"]: entry["algorithm"] for entry in results}
-    found = {(entry["agent"], entry["map"], entry["tasks"]): entry for entry in results}
+    entries = {(entry["agent"], entry["map"], entry["tasks"]): entry for entry in results}
     rows = []
     for agent, algorithm in agents.items():
-        cells = [_cells(found.get((agent, *world))) for world in worlds]
-        name = _REFERENCES.get(algorithm, agent)
-        rows.append(_row(name, cells, "reference" if algorithm in _REFERENCES else ""))
-    look = "reference first"
+        cells = [_cells(entries.get((agent, *world))) for world in worlds]
+        name = _BASELINE_NAMES.get(algorithm, agent)
+        rows.append(_row(name, cells, "reference" if algorithm in _BASELINE_NAMES else ""))
+    style = "reference first"
     for algorithm in dict.fromkeys(agents.values()):
         cells = [_paper_cells(algorithm, world, settings) for world in worlds]
         if any(any(pair) for pair in cells):
-            rows.append(_row(f"the paper, {algorithm.upper()}", cells, look))
-            look = "reference"
+            rows.append(_row(f"the paper, {algorithm.upper()}", cells, style))
+            style = "reference"
     names = [_world({"map": name, "tasks": tasks}, settings) for name, tasks in worlds]
     above = "".join(f'<th colspan="2" scope="colgroup">{escape(name)}</th>' for name in names)
     below = '<th scope="col">success</th><th scope="col">steps</th>' * len(names)
-    note = "In brackets a 95 % interval over episodes; training seeds may differ by more."
-    if look == "reference":
-        note += " The paper's numbers are on maps of its own, which are not published."
+    note = "In brackets: 95 % interval over episodes; training seeds may differ by more."
+    if style == "reference":
+        note += " The numbers of the paper are for its own maps, which are not published."
     return "\n".join(
         [
             '<div class="scroll"><table class="results">',
@@ -271,19 +272,19 @@ def _cells(entry: dict[str, Any] | None) -> tuple[str, str]:
 
 
 def _paper_cells(algorithm: str, world: tuple[str, str], settings: Settings) -> tuple[str, str]:
-    """The paper's numbers for one of its maps; a user's file may have the same name."""
+    """The numbers of the paper for one of its maps; a user's file may have the same name."""
     name, tasks = world
     results = PAPER_RESULTS.get(algorithm, {})
-    known = name in PAPER_MAPS and name in settings.maps and tasks == "evaluation points"
-    if not known or name not in results:
+    is_paper_map = name in PAPER_MAPS and name in settings.maps and tasks == "evaluation points"
+    if not is_paper_map or name not in results:
         return "", ""
     success, steps = results[name]
     return f"{success:.2f}", f"{steps:,.1f}"
 
 
-def _row(name: str, cells: Sequence[tuple[str, str]], look: str) -> str:
-    told = "".join(f"<td>{escape(cell)}</td>" for pair in cells for cell in pair)
-    return f'<tr class="{look}"><th scope="row">{escape(name)}</th>{told}</tr>'
+def _row(name: str, cells: Sequence[tuple[str, str]], style: str) -> str:
+    columns = "".join(f"<td>{escape(cell)}</td>" for pair in cells for cell in pair)
+    return f'<tr class="{style}"><th scope="row">{escape(name)}</th>{columns}</tr>'
 
 
 def _training(content: Content, pictures: Illustrations) -> Iterable[str]:
@@ -307,7 +308,7 @@ def _figure(picture: Illustration) -> str:
 
 
 def _settings(run: Run) -> Iterable[str]:
-    """What differs from the nearest preset, then everything; on what it was trained."""
+    """Where a run was trained, its changes to the nearest preset, and all of its settings."""
     config = run.policy.config
     preset, changes = changed_settings(config)
     yield f"<h3>{escape(run.name)}</h3>"
@@ -325,9 +326,9 @@ def _settings(run: Run) -> Iterable[str]:
         )
     else:
         yield f"<p>Every setting is that of the preset {escape(preset)}.</p>"
-    whole = json.dumps(configs.to_dict(config), indent=2)
+    text = json.dumps(configs.to_dict(config), indent=2)
     yield (
-        f"<details><summary>All settings ({CONFIG})</summary><pre>{escape(whole)}</pre></details>"
+        f"<details><summary>All settings ({CONFIG})</summary><pre>{escape(text)}</pre></details>"
     )
 
 
@@ -336,8 +337,8 @@ def _provenance(run: Run) -> str:
     summary = run.summary
     parts = []
     if "device" in summary:
-        times = summary.get("num_devices", 1)
-        parts.append(f"device {summary['device']}" + (f" x {times}" if times != 1 else ""))
+        count = summary.get("num_devices", 1)
+        parts.append(f"device {summary['device']}" + (f" x {count}" if count != 1 else ""))
     versions = summary.get("versions")
     if isinstance(versions, dict):
         parts += [f"{name} {version}" for name, version in versions.items()]

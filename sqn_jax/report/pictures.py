@@ -1,4 +1,4 @@
-"""The pictures of a report, as bytes."""
+"""The pictures of a report, as PNG and GIF."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from sqn_jax import figures
-from sqn_jax.evaluation.compare import EpisodeBatch, Learnt
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.episodes import episode_keys
 from sqn_jax.evaluation.recording import Episode, record_episodes
 from sqn_jax.evaluation.settings import task_key
 from sqn_jax.figures.animation import gif
 from sqn_jax.report.content import Content, Run
-from sqn_jax.report.episodes import NEAR, HardEpisode, Place
+from sqn_jax.report.episodes import NEAR, Place, WorstEpisode
 
 MOST_BYTES = 7_000_000
-"""Of all pictures of a page, which is a third larger; pictures of paths beyond it are left out."""
+"""Of all pictures of a page, which is a third larger; further pictures of paths are left out."""
 
 _FRAMES, _FRAME_WIDTH_PX = 100, 560
 _INK, _PAPER = "#222222", "white"
@@ -30,7 +30,7 @@ class Illustration:
 
     data: bytes
     text: str
-    """In place of the picture, for those who cannot see it."""
+    """Alternative text of the picture."""
     caption: str
 
 
@@ -38,29 +38,30 @@ class Illustration:
 class Illustrations:
     """All pictures of a page."""
 
-    hardest: list[Illustration]
-    """One for each of `Content.hardest`."""
+    worst: list[Illustration]
+    """One for each of `Content.worst`."""
     curves: list[Illustration]
     paths: list[Illustration]
     paths_left_out: int
-    """How many more there would be."""
+    """Number of pictures of paths that were left out."""
     animation: Illustration
 
 
-def draw(content: Content) -> Illustrations:
-    """Draw all that a page shows."""
-    hardest = [_hard_picture(hard) for hard in content.hardest]
+def draw_pictures(content: Content) -> Illustrations:
+    """Draw all pictures of a page."""
+    worst = [_worst_picture(episode) for episode in content.worst]
     training = curves(content)
     animation = _animation(content)
-    room = MOST_BYTES - sum(len(each.data) for each in (*hardest, *training, animation))
+    pictures = (*worst, *training, animation)
+    bytes_left = MOST_BYTES - sum(len(picture.data) for picture in pictures)
     first = _first_batches(content.batches)
     paths: list[Illustration] = []
     for batch in first:
         paths.append(_paths(batch))
-        room -= len(paths[-1].data)
-        if room < 0:
+        bytes_left -= len(paths[-1].data)
+        if bytes_left < 0:
             break
-    return Illustrations(hardest, training, paths, len(first) - len(paths), animation)
+    return Illustrations(worst, training, paths, len(first) - len(paths), animation)
 
 
 def _title(batch: EpisodeBatch) -> str:
@@ -68,7 +69,7 @@ def _title(batch: EpisodeBatch) -> str:
 
 
 def _trajectories(batch: EpisodeBatch, chosen: slice, title: str) -> Any:
-    """Episodes of a batch over the distance fields of their goals."""
+    """The paths of some episodes of a batch over the distance fields of their goals."""
     env_params, trajectory = batch.world.env_params, batch.trajectory
     return figures.trajectories(
         batch.world.occupancy_map,
@@ -83,36 +84,36 @@ def _trajectories(batch: EpisodeBatch, chosen: slice, title: str) -> Any:
     )
 
 
-def _hard_picture(hard: HardEpisode) -> Illustration:
+def _worst_picture(worst: WorstEpisode) -> Illustration:
     """The path, and a circle around the place where the robot was most of the time."""
-    episode = slice(hard.episode, hard.episode + 1)
-    figure = _trajectories(hard.batch, episode, f"{_title(hard.batch)}, episode {hard.episode}")
-    _mark(figure.axes[0], hard.place, stuck=not hard.success and hard.place.is_most)
+    chosen, place = slice(worst.episode, worst.episode + 1), worst.place
+    figure = _trajectories(worst.batch, chosen, f"{_title(worst.batch)}, episode {worst.episode}")
+    _mark(figure.axes[0], place, is_stuck=not worst.success and place.is_most)
     return Illustration(
         figures.picture(figure).png,
         "The path of the robot over the distance to its goal, with a circle around the place "
-        f"({hard.place.x:.1f}, {hard.place.y:.1f}) m.",
-        f"The circle, {NEAR:g} m around ({hard.place.x:.1f}, {hard.place.y:.1f}) m, is the place "
+        f"({place.x:.1f}, {place.y:.1f}) m.",
+        f"The circle, {NEAR:g} m around ({place.x:.1f}, {place.y:.1f}) m, is the place "
         "where the robot was most of the time.",
     )
 
 
-def _mark(axes: Any, place: Place, *, stuck: bool) -> None:
-    """A circle around a place, with a word above it or, near the upper edge, below it."""
-    turn = np.linspace(0, 2 * np.pi, 100)
-    for colour, width in ((_PAPER, 4.5), (_INK, 2.0)):
-        x, y = place.x + NEAR * np.cos(turn), place.y + NEAR * np.sin(turn)
-        axes.plot(x, y, color=colour, lw=width, zorder=8)
+def _mark(axes: Any, place: Place, *, is_stuck: bool) -> None:
+    """Draw a circle around a place, with a label above it or, near the upper edge, below it."""
+    angles = np.linspace(0, 2 * np.pi, 100)
+    for color, width in ((_PAPER, 4.5), (_INK, 2.0)):
+        x, y = place.x + NEAR * np.cos(angles), place.y + NEAR * np.sin(angles)
+        axes.plot(x, y, color=color, lw=width, zorder=8)
     (left, right), (_, top) = axes.get_xlim(), axes.get_ylim()
-    above = place.y + NEAR < 0.9 * top
-    across = (place.x - left) / (right - left)
+    is_above = place.y + NEAR < 0.9 * top
+    fraction = (place.x - left) / (right - left)
     axes.annotate(
-        "stuck here" if stuck else "longest here",
-        (place.x, place.y + (NEAR if above else -NEAR)),
-        (0, 5 if above else -5),
+        "stuck here" if is_stuck else "longest here",
+        (place.x, place.y + (NEAR if is_above else -NEAR)),
+        (0, 5 if is_above else -5),
         textcoords="offset points",
-        ha="left" if across < 0.1 else "right" if across > 0.9 else "center",
-        va="bottom" if above else "top",
+        ha="left" if fraction < 0.1 else "right" if fraction > 0.9 else "center",
+        va="bottom" if is_above else "top",
         fontsize=10,
         fontweight="bold",
         color=_INK,
@@ -122,36 +123,36 @@ def _mark(axes: Any, place: Place, *, stuck: bool) -> None:
 
 
 def curves(content: Content) -> list[Illustration]:
-    """How training went: of one run all curves, of several the two that compare them."""
-    told = [run for run in content.runs if run.metrics]
-    if not told:
+    """The curves of training: all curves of one run, or those that compare several runs."""
+    runs = [run for run in content.runs if run.metrics]
+    if not runs:
         return []
-    if len(told) == 1:
-        (run,) = told
+    if len(runs) == 1:
+        (run,) = runs
         figure = figures.learning_curve(run.metrics, title=f"Training of {run.name}")
-        return [_curve(figure, "Reward, success, loss and, of several skills, their weights.")]
-    rows = {id(run.policy): run.metrics for run in told}
+        return [_curve(figure, "Reward, success, loss and, with several skills, their weights.")]
+    rows = {id(run.policy): run.metrics for run in runs}
     by_agent = {
         agent.name: [rows[id(p)] for p in agent.policies if id(p) in rows]
         for agent in content.agents
     }
-    by_agent = {name: runs for name, runs in by_agent.items() if runs}
+    by_agent = {name: rows_of_runs for name, rows_of_runs in by_agent.items() if rows_of_runs}
     pictures = [
         _curve(
             figures.learning_curves(by_agent, title="Training"),
-            "Mean reward and success under exploration noise; where an agent has several training "
-            "seeds, the line is their mean and the band a 95 % interval of it.",
+            "Mean reward and success under exploration noise; if an agent has several training "
+            "seeds, the line is their mean and the band its 95 % interval.",
         )
     ]
-    gated = {run.name: run.metrics for run in told if _tells_of_skills(run)}
-    if gated:
-        figure = figures.gate_entropy_curves(gated, title="Entropy of the skill decision")
+    by_run = {run.name: run.metrics for run in runs if _has_skill_metrics(run)}
+    if by_run:
+        figure = figures.gate_entropy_curves(by_run, title="Entropy of the skill decision")
         pictures.append(_curve(figure, "How evenly the skills share the decision."))
     return pictures
 
 
-def _tells_of_skills(run: Run) -> bool:
-    """Whether every row of a run's metrics has what the curve of the skill decision needs."""
+def _has_skill_metrics(run: Run) -> bool:
+    """Whether all rows of metrics of a run have what the curve of the skill decision needs."""
     names = {"episodes", "gate_entropy", "skill_usage"}
     config = run.policy.config
     has_skills = config.algo == "sqn" and config.network.num_skills > 1
@@ -165,7 +166,7 @@ def _curve(figure: Any, caption: str) -> Illustration:
 
 
 def _first_batches(batches: Sequence[EpisodeBatch]) -> list[EpisodeBatch]:
-    """Of each agent in each world the first training seed under the first evaluation seed."""
+    """For each agent in each world, the first training seed under the first evaluation seed."""
     first: dict[tuple[str, int], EpisodeBatch] = {}
     for batch in batches:
         first.setdefault((batch.agent.name, id(batch.world)), batch)
@@ -182,23 +183,25 @@ def _paths(batch: EpisodeBatch) -> Illustration:
 
 
 def _animation(content: Content) -> Illustration:
-    """The worst failure; if there is none, the first episode of all."""
-    failures = [hard for hard in content.hardest if not hard.success]
-    batch, number = content.batches[0], 0
+    """An animation of the worst failure; without failures, of the first episode."""
+    failures = [worst for worst in content.worst if not worst.success]
+    batch, index = content.batches[0], 0
     if failures:
-        batch, number = failures[0].batch, failures[0].episode
-    episode = _recorded(batch, number)
+        batch, index = failures[0].batch, failures[0].episode
+    episode = _recorded(batch, index)
     outcome = f"not reached within {episode.num_steps:,} steps"
     if episode.success:
         outcome = f"reached after {episode.time_steps:,} steps"
     data = gif(episode, count=_FRAMES, width_px=_FRAME_WIDTH_PX)
-    shown = f"{_title(batch)}, episode {number} of evaluation seed {batch.eval_seed}: {outcome}"
-    return Illustration(data, f"An animation of {shown}.", f"{shown}.")
+    description = (
+        f"{_title(batch)}, episode {index} of evaluation seed {batch.eval_seed}: {outcome}"
+    )
+    return Illustration(data, f"An animation of {description}.", f"{description}.")
 
 
-def _recorded(batch: EpisodeBatch, number: int) -> Episode:
-    """One of the episodes with all that a film of it needs."""
-    assert isinstance(batch.agent, Learnt)
-    keys = episode_keys(task_key(batch.eval_seed, batch.world.tasks), number + 1)[number:]
+def _recorded(batch: EpisodeBatch, index: int) -> Episode:
+    """Record one episode of a batch again, for an animation."""
+    assert isinstance(batch.agent, TrainedAgent)
+    keys = episode_keys(task_key(batch.eval_seed, batch.world.tasks), index + 1)[index:]
     (episode,) = record_episodes(keys, batch.agent, batch.training_seed, batch.world)
     return episode

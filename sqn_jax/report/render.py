@@ -1,6 +1,6 @@
-"""Films and pictures of what trained policies do on a map: what `sqn render` does.
+"""Animations and pictures of trained policies on a map, for `sqn render`.
 
-Every policy is given the same tasks, `recording` keeps its episodes, `figures` draws them.
+All policies get the same tasks; `recording` records their episodes, `figures` draws them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from tqdm import tqdm
 from sqn_jax import figures
 from sqn_jax.config import EnvConfig
 from sqn_jax.config.map_names import parse
-from sqn_jax.evaluation.compare import Learnt, Settings, Tasks, World, load_maps
+from sqn_jax.evaluation.agents import TrainedAgent
+from sqn_jax.evaluation.compare import load_maps
 from sqn_jax.evaluation.episodes import episode_keys
 from sqn_jax.evaluation.recording import Episode, record_episodes
-from sqn_jax.evaluation.settings import robot_for, task_key, worlds
+from sqn_jax.evaluation.settings import Settings, Tasks, World, robot_for, task_key, worlds
 from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.policies.run_policies import Policy
@@ -27,7 +28,7 @@ from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import probe_writable, written_whole
 
 MOST_EPISODES = 32
-"""Of each policy; an episode in the cave takes 7 MB of memory."""
+"""Per policy; an episode in the cave takes 7 MB of memory."""
 
 EpisodesByAgent = Mapping[str, list[Episode]]
 
@@ -46,23 +47,23 @@ def render_session(
     max_steps: int = 0,
     mp4: bool = False,
 ) -> list[Path]:
-    """Drive policies greedily and draw what they did, telling the terminal about it.
+    """Run greedy episodes of policies, draw them, and print progress.
 
     Args:
-        policies: who drives, with the first of its training seeds.
-        out: the folder to write into; made where it is missing, files of the same names replaced.
+        policies: the policies; of each, the first training seed is used.
+        out: the folder to write to; created if missing; files of the same names are replaced.
         map_name: a map of the project, or a file.
-        tasks: from the evaluation points or between random pairs of spawn points.
-        episodes: of each policy, 1 to 32; the first ones of `sqn evaluate`'s.
-        animations: films of each policy, 0 to `episodes`.
+        tasks: between evaluation points, or random pairs of spawn points.
+        episodes: per policy, 1 to 32; the first ones of `sqn evaluate`.
+        animations: per policy, 0 to `episodes`.
         seed: the evaluation seed.
-        noise: of the velocity and of the ranges, in the units each policy was configured with.
-        max_steps: steps an episode; 0 for the map's own limit.
-        mp4: write every film as MP4, too.
+        noise: of the velocity and of the ranges, in the units of each policy's config.
+        max_steps: steps per episode; 0: the limit of the map.
+        mp4: also write every animation as MP4.
 
     Returns:
-        The files written: the paths (of several agents side by side, task by task), and for each
-        agent a timeline of its first episode and its films.
+        The files written: the paths (several agents side by side, task by task), and for each agent
+        a timeline of its first episode and its animations.
 
     Raises:
         ValueError: an option is out of its range, the map is unusable for a robot, there are too
@@ -83,31 +84,31 @@ def render_session(
         noise=(noise,),
         max_steps=max_steps,
     )
-    agents = {name: Learnt(name, (policy,)) for name, policy in agent_names(policies).items()}
+    agents = {name: TrainedAgent(name, (policy,)) for name, policy in agent_names(policies).items()}
     maps = load_maps(list(agents.values()), settings)
     _make_folder(out)
-    ready: dict[EnvConfig, World] = {}
+    world_of: dict[EnvConfig, World] = {}
     keys = episode_keys(task_key(seed, tasks), episodes)
     recorded: dict[str, list[Episode]] = {}
     for name, agent in agents.items():
         robot = robot_for(agent.env_config, settings)
-        if robot not in ready:
+        if robot not in world_of:
             print(f"preparing {map_name} for the robot ...", flush=True)
-            (ready[robot],) = worlds(robot, maps, settings)
-        print(f"{name} drives ...", end="", flush=True)
-        seed_of_first = agent.training_seeds[0]
-        recorded[name] = record_episodes(keys, agent, seed_of_first, ready[robot])
+            (world_of[robot],) = worlds(robot, maps, settings)
+        print(f"{name}: running ...", end="", flush=True)
+        first_seed = agent.training_seeds[0]
+        recorded[name] = record_episodes(keys, agent, first_seed, world_of[robot])
         print(f"\r{name}: {_outcome(recorded[name])}")
     return _draw(recorded, out, tasks=tasks, animations=animations, mp4=mp4)
 
 
 def agent_names(policies: Sequence[Policy]) -> dict[str, Policy]:
-    """What the policies are called in pictures: as their network, and as their run if need be.
+    """Names of the policies in pictures: the algorithm, and the run where this is not unique.
 
-    Those that would be called the same are numbered; of several training seeds the first drives.
+    Names that would still be equal are numbered. The seed is that of the episodes, the first one.
 
     Raises:
-        ValueError: there is none, or there are too many to stand side by side.
+        ValueError: no policies, or too many to draw side by side.
     """
     if not 1 <= len(policies) <= MAX_AGENTS:
         raise ValueError(f"{len(policies)} policies to render, expected 1 to {MAX_AGENTS}")
@@ -120,16 +121,16 @@ def agent_names(policies: Sequence[Policy]) -> dict[str, Policy]:
         if len(policy.params) > 1:
             name += f" seed {policy.training_seeds[0]}"
         taken = [_file_name(other) for other in names]
-        number, full = 1, name
-        while _file_name(full) in taken:
+        number, unique_name = 1, name
+        while _file_name(unique_name) in taken:
             number += 1
-            full = f"{name} ({number})"
-        names[full] = policy
+            unique_name = f"{name} ({number})"
+        names[unique_name] = policy
     return names
 
 
 def default_folder(policies: Sequence[Policy], map_name: str) -> Path:
-    """`renders/NAME_MAP` below the current folder."""
+    """`renders/RUN_MAP` in the current folder."""
     name = policies[0].name
     if len(policies) > 1:
         name += f"_and_{len(policies) - 1}_more"
@@ -149,20 +150,20 @@ def _make_folder(out: Path) -> None:
 
 
 def _outcome(episodes: Sequence[Episode]) -> str:
-    reached = [episode.time_steps for episode in episodes if episode.success]
-    told = f"{len(reached)} of {len(episodes)} goals reached"
-    return told + (f", {sum(reached) / len(reached):.0f} steps on average" if reached else "")
+    steps = [episode.time_steps for episode in episodes if episode.success]
+    outcome = f"{len(steps)} of {len(episodes)} goals reached"
+    return outcome + (f", {sum(steps) / len(steps):.0f} steps on average" if steps else "")
 
 
 def _draw(
     recorded: EpisodesByAgent, out: Path, *, tasks: Tasks, animations: int, mp4: bool
 ) -> list[Path]:
-    """Write all files under a progress bar; returns them."""
-    where = next(iter(recorded.values()))[0].occupancy_map.name
+    """Write all files with a progress bar; returns them."""
+    map_name = next(iter(recorded.values()))[0].occupancy_map.name
     jobs: dict[Path, Callable[[Path], None]] = {}
-    jobs[out / "trajectories.png"] = partial(_draw_paths, recorded, f"{where}, {tasks}")
+    jobs[out / "trajectories.png"] = partial(_draw_paths, recorded, f"{map_name}, {tasks}")
     for name, episodes in recorded.items():
-        title = f"{name} on {where}, {tasks}, episode 1"
+        title = f"{name} on {map_name}, {tasks}, episode 1"
         file = _file_name(name)
         jobs[out / f"{file}_timeline_1.png"] = partial(_draw_timeline, episodes[0], title)
         for number, episode in enumerate(episodes[:animations], start=1):
@@ -182,7 +183,7 @@ def _draw(
 
 
 def _draw_paths(recorded: EpisodesByAgent, title: str, path: Path) -> None:
-    """One agent's paths on one map, several agents task by task."""
+    """The paths of one agent on one map, or of several agents task by task."""
     if len(recorded) == 1:
         ((name, episodes),) = recorded.items()
         figures.save(figures.skill_trajectories(episodes, title=f"{name} on {title}"), path)
@@ -199,16 +200,16 @@ def _draw_timeline(episode: Episode, title: str, path: Path) -> None:
 
 
 def _draw_gif(episode: Episode, path: Path) -> None:
-    film = animation.gif(episode)
+    data = animation.gif(episode)
     with written_whole(path) as partial_path:
-        partial_path.write_bytes(film)
+        partial_path.write_bytes(data)
 
 
 def _draw_mp4(episode: Episode, path: Path) -> None:
     animation.mp4(path, episode)
 
 
-def _size(number_of_bytes: int) -> str:
-    if number_of_bytes < 1e6:
-        return f"{number_of_bytes / 1e3:.0f} kB"
-    return f"{number_of_bytes / 1e6:.1f} MB"
+def _size(num_bytes: int) -> str:
+    if num_bytes < 1e6:
+        return f"{num_bytes / 1e3:.0f} kB"
+    return f"{num_bytes / 1e6:.1f} MB"

@@ -1,1 +1,1 @@
-"""A training run as a person starts it: progress, signals, files, what follows it."""
+"""Training and evaluation as commands run them: progress, signals, files, final evaluation."""

@@ -1,4 +1,4 @@
-"""When learning has gone astray: what is checked after every chunk, and what is left to look at."""
+"""Divergence: the check after every chunk, and the dump of a run that has diverged."""
 
 from __future__ import annotations
 
@@ -17,68 +17,68 @@ SHOWN_ROWS = 20
 
 
 class Diverged(FloatingPointError):
-    """A run was stopped since it no longer computes with numbers."""
+    """A run was stopped because it has diverged."""
 
 
-def require_sound(
+def raise_if_diverged(
     row: Mapping[str, Any], learner: LearnerState, config: TrainConfig, folder: RunFolder
 ) -> None:
-    """Stop a run that is lost: nothing of this chunk is to be saved.
+    """Stop a run that has diverged, before this chunk is saved.
 
-    Single updates whose loss or gradient is not finite have been left out already.
+    Single updates with a loss or gradient that is not finite have been skipped already.
 
     Args:
-        row: of metrics.jsonl.
-        learner: after the chunk.
-        config: of the run.
-        folder: where the dump goes.
+        row: the row of this chunk in metrics.jsonl.
+        learner: the learner state after the chunk.
+        config: the config of the run.
+        folder: the run folder, to which the dump is written.
 
     Raises:
-        Diverged: more updates were skipped than the config allows, or parameters or the
-            optimiser's moments are not finite.
+        Diverged: more updates were skipped than the config allows, or parameters or moments of
+            the optimizer are not finite.
     """
     skipped, finite = np.atleast_1d(row["skipped_updates"]), np.atleast_1d(row["finite"])
-    lost = (skipped > config.max_skipped_updates) | ~finite
-    if not lost.any():
+    has_diverged = (skipped > config.max_skipped_updates) | ~finite
+    if not has_diverged.any():
         return
-    index = int(np.argmax(lost))
+    index = int(np.argmax(has_diverged))
     seed = config.seed + index
     if finite[index]:
-        why = (
+        reason = (
             f"{skipped[index]:,} of {row['updates']:,} updates had a loss or gradient that is not "
             f"finite, more than max_skipped_updates ({config.max_skipped_updates})"
         )
     else:
-        why = "parameters are no longer finite"
+        reason = "parameters are no longer finite"
     folder.write_json(
         DUMP,
         {
             "chunk": row["chunk"],
             "episodes": row["episodes"],
-            "seeds": [config.seed + int(each) for each in np.flatnonzero(lost)],
-            "why": why,
+            "seeds": [config.seed + int(index) for index in np.flatnonzero(has_diverged)],
+            "why": reason,
             "learning_rate": config.learner.learning_rate,
             "arrays": _arrays(learner, index if config.num_seeds > 1 else None),
             "last_rows": folder.read_metrics()[-SHOWN_ROWS:],
         },
     )
     raise Diverged(
-        f"stopped at chunk {row['chunk']}, seed {seed}: {why}; {folder.path / DUMP} says where. "
+        f"stopped at chunk {row['chunk']}, seed {seed}: {reason}; {folder.path / DUMP} says where. "
         "What was saved before is finite"
     )
 
 
 def _arrays(learner: LearnerState, index: int | None) -> dict[str, dict[str, Any]]:
-    """Of every array of the learner, the largest number and how many are none; the worst first."""
-    found = {}
+    """The largest value of each array and how many are not finite; the worst arrays first."""
+    arrays = {}
     parts = {"params": learner.params, "opt_state": learner.opt_state}
     for path, leaf in leaves_of(parts):
-        numbers = np.asarray(leaf if index is None else leaf[index], dtype=np.float64)
-        is_finite = np.isfinite(numbers)
-        found[path] = {
-            "largest": float(np.abs(numbers[is_finite]).max(initial=0.0)),
+        values = np.asarray(leaf if index is None else leaf[index], dtype=np.float64)
+        is_finite = np.isfinite(values)
+        arrays[path] = {
+            "largest": float(np.abs(values[is_finite]).max(initial=0.0)),
             "not_finite": int((~is_finite).sum()),
-            "of": int(numbers.size),
+            "of": int(values.size),
         }
-    worst = sorted(found, key=lambda path: (-found[path]["not_finite"], -found[path]["largest"]))
-    return {path: found[path] for path in worst}
+    worst = sorted(arrays, key=lambda path: (-arrays[path]["not_finite"], -arrays[path]["largest"]))
+    return {path: arrays[path] for path in worst}

@@ -1,4 +1,4 @@
-"""An evaluation as a person starts it: under a progress bar, written to a file."""
+"""An evaluation with a progress bar, written to a file."""
 
 from __future__ import annotations
 
@@ -6,14 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sqn_jax.evaluation.compare import (
-    Agent,
-    OnEvaluated,
-    Settings,
-    evaluate_agents,
-    load_maps,
-    num_episodes,
-)
+from sqn_jax.evaluation.agents import Agent
+from sqn_jax.evaluation.compare import OnEvaluated, evaluate_agents, load_maps, num_episodes
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import write_json, write_records
@@ -27,20 +22,20 @@ def evaluate_session(
     on_evaluated: OnEvaluated = lambda batch: None,
     fields: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Evaluate agents under a progress bar.
+    """Evaluate agents with a progress bar.
 
     Args:
-        agents: who acts; see `compare.evaluate_agents`.
-        settings: where and how often.
-        out: where to write the evaluation, a JSON file, and beside it one record an episode.
+        agents: see `compare.evaluate_agents`.
+        settings: see `compare.evaluate_agents`.
+        out: the JSON file to write; the records of the episodes go beside it, as JSON lines.
         on_evaluated: see `compare.evaluate_agents`.
         fields: see `compare.evaluate_agents`.
 
     Returns:
-        The evaluation as written.
+        The contents of the evaluation file.
 
     Raises:
-        ValueError: a map is unusable for a robot; nothing was run then.
+        ValueError: a map is unusable for a robot; nothing has been run.
     """
     maps = load_maps(agents, settings)
     with episodes_bar(num_episodes(agents, settings)) as bar:

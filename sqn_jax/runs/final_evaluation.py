@@ -1,4 +1,4 @@
-"""What follows a training run: its evaluation, its figures, its summary."""
+"""The end of a training run: final evaluation, figures, summary."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import jax
 import sqn_jax
 from sqn_jax.agent.learner import policy_params
 from sqn_jax.config import TrainConfig
-from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings, evaluate_agents
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.compare import evaluate_agents
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
@@ -17,22 +19,22 @@ from sqn_jax.training import devices
 from sqn_jax.training.state import RunnerState
 
 
-def evaluate(
+def evaluate_run(
     runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> tuple[list[dict[str, Any]], list[EpisodeBatch]]:
-    """Greedy episodes of every seed from the evaluation points and from random pairs.
+    """Run greedy episodes of every training seed, between evaluation points and random pairs.
 
     Args:
         runner: the final state.
         occupancy_map: the first map of the run.
-        config: of the run.
-        folder: of the run.
+        config: the config of the run.
+        folder: the run folder.
 
     Returns:
-        The results, and for each kind of task the episodes of the first seed.
+        The results, and the episodes of the first seed for each kind of task.
     """
     name = str(config.maps.names[0])
-    # On one device: every program that is given them would else run on each of the mesh.
+    # On one device; otherwise every program that uses them would run on all of the mesh.
     params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
     policy = Policy(folder.path.name, config, seeds_of(params, config))
     settings = Settings(
@@ -47,15 +49,15 @@ def evaluate(
     )
     of_first_seed: list[EpisodeBatch] = []
 
-    def keep(batch: EpisodeBatch) -> None:
+    def collect(batch: EpisodeBatch) -> None:
         if batch.training_seed == policy.training_seeds[0]:
             of_first_seed.append(batch)
 
     evaluation, records = evaluate_agents(
-        [Learnt(config.algo, (policy,))],
+        [TrainedAgent(config.algo, (policy,))],
         {(name, config.env.robot_radius): occupancy_map},
         settings,
-        on_evaluated=keep,
+        on_evaluated=collect,
         fields=("output",),
     )
     folder.write_json("evaluation.json", evaluation)
@@ -63,10 +65,10 @@ def evaluate(
     return evaluation["results"], of_first_seed
 
 
-def draw(
+def draw_figures(
     batches: list[EpisodeBatch], occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> bool:
-    """Write the figures; says so and returns False where Matplotlib is not installed."""
+    """Write the figures; print a message and return False if Matplotlib is not installed."""
     try:
         from sqn_jax import figures
     except ImportError:
@@ -79,7 +81,7 @@ def draw(
     figures.save(curve, folder.figures / "learning_curve.png")
     for batch in batches:
         tasks = batch.world.tasks
-        drawing = figures.trajectories(
+        figure = figures.trajectories(
             occupancy_map,
             batch.goals,
             batch.trajectory.poses,
@@ -90,7 +92,7 @@ def draw(
             robot_radius=config.env.robot_radius,
             title=f"{name}, {tasks}" + (f", seed {config.seed}" if config.num_seeds > 1 else ""),
         )
-        figures.save(drawing, folder.figures / f"trajectories_{tasks.replace(' ', '_')}.png")
+        figures.save(figure, folder.figures / f"trajectories_{tasks.replace(' ', '_')}.png")
     return True
 
 
@@ -101,11 +103,11 @@ def _duration(seconds: float) -> str:
 def conclude(
     results: list[dict[str, Any]],
     timing: dict[str, float],
-    figures: bool,
+    has_figures: bool,
     config: TrainConfig,
     folder: RunFolder,
 ) -> None:
-    """Write summary.json and say what it came to."""
+    """Write summary.json and print a summary."""
     summary: dict[str, Any] = {
         "episodes": config.num_rounds * config.num_envs,
         "wall_seconds": round(timing["train_seconds"], 1),
@@ -134,5 +136,5 @@ def conclude(
             + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
         )
     folder.write_json("summary.json", summary)
-    if figures:
+    if has_figures:
         print(f"figures in {folder.figures}")

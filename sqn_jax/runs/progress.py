@@ -1,4 +1,4 @@
-"""The bar that shows how far a command has come."""
+"""The progress bar of a command."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 
 def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
-    """A bar over episodes; where nobody watches, a line now and then."""
+    """A progress bar over episodes; updated less often where stderr is not a terminal."""
     return tqdm(
         total=total,
         initial=done,

@@ -1,8 +1,8 @@
-"""What SIGINT, SIGTERM and SIGHUP, of a terminal that is gone, do to a command.
+"""How a command reacts to SIGINT, SIGTERM and SIGHUP (the terminal was closed).
 
-Where nothing would be lost they do what the system does by default: they end the process at once,
-in the middle of a compilation, too, of which Python would hear only after it. How to go on has been
-said before. While chunks of training run they are noted instead: the chunk is finished and saved.
+While nothing would be lost, the system's default applies: the signal ends the process at once, also
+during a compilation, after which Python would react only. The command to resume with has been
+printed before. During training a signal is recorded instead: the chunk is finished and saved.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal came in while a run trained; what it had trained is saved."""
+    """A signal stopped a training run; its state is saved."""
 
-    def __init__(self, number: int, go_on: str = "") -> None:
+    def __init__(self, number: int, resume_command: str = "") -> None:
         self.exit_code = 128 + number
-        """130, 143 or 129, as a shell says of a process that a signal has ended."""
-        told = f", go on with {go_on}" if go_on else ""
-        super().__init__(f"stopped by {signal.Signals(number).name} after saving{told}")
+        """130, 143 or 129, as a shell reports a process that a signal has ended."""
+        advice = f", resume with {resume_command}" if resume_command else ""
+        super().__init__(f"stopped by {signal.Signals(number).name} after saving{advice}")
 
 
 def end_at_once() -> None:
@@ -38,49 +38,49 @@ def end_at_once() -> None:
 
 @contextmanager
 def deferred(waiting_for: str) -> Iterator[list[int]]:
-    """Note signals, since something is to be saved first; a second one does what it did before.
+    """Record signals instead of ending, so that a run can save first; a second one ends it.
 
-    What was started to go on without its terminal, by nohup, goes on.
+    A process that ignores SIGHUP (`nohup`) continues to do so.
 
     Args:
-        waiting_for: what is done before ending, as the user is told upon the first signal.
+        waiting_for: what is done before the process ends; printed upon the first signal.
 
     Yields:
-        The signals so far.
+        A list, to which the numbers of the signals are appended.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
-    before = {each: signal.getsignal(each) for each in STOPPING}
+    handlers = {number: signal.getsignal(number) for number in STOPPING}
     terminals = [stream for stream in (1, 2) if os.isatty(stream)]
 
-    def note(number: int, _: FrameType | None) -> None:
+    def record(number: int, _: FrameType | None) -> None:
         if number == signal.SIGHUP:
-            # To write to a terminal that is gone fails, and would keep the run from saving.
-            nowhere = os.open(os.devnull, os.O_WRONLY)
+            # Writing to a closed terminal fails, and would prevent the run from saving.
+            null_device = os.open(os.devnull, os.O_WRONLY)
             for stream in terminals:
-                os.dup2(nowhere, stream)
-            os.close(nowhere)
+                os.dup2(null_device, stream)
+            os.close(null_device)
         if not received:
-            with suppress(OSError):  # Not through `sys.stderr`: it may be at work just now.
+            with suppress(OSError):  # Not through `sys.stderr`, which may be in use.
                 os.write(2, f"\n{waiting_for}; once more to stop at once\n".encode())
-            # But a terminal that closes may say so twice, and after Ctrl-C.
-            for each in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(each, before[each])
+            # Not for SIGHUP: a closing terminal may send it twice, and after Ctrl-C.
+            for stop in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(stop, handlers[stop])
         received.append(number)
 
-    for each, handler in before.items():
-        if each != signal.SIGHUP or handler != signal.SIG_IGN:
-            signal.signal(each, note)
+    for number, handler in handlers.items():
+        if number != signal.SIGHUP or handler != signal.SIG_IGN:
+            signal.signal(number, record)
     try:
         yield received
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def wait_for(arrays: Any) -> None:
-    """Wait until arrays are computed, in naps: Python handles signals between them, not in JAX."""
-    while not all(each.is_ready() for each in jax.tree.leaves(arrays)):
+    """Wait until arrays are computed, in short sleeps: Python handles no signals inside JAX."""
+    while not all(array.is_ready() for array in jax.tree.leaves(arrays)):
         time.sleep(0.005)

@@ -1,6 +1,6 @@
-"""The metrics of a run for TensorBoard, written while it trains, and its pictures at the end.
+"""TensorBoard: the metrics of a run while it trains, and its figures at the end.
 
-Needs the extra `sqn_jax[tensorboard]`. Read with `tensorboard --logdir RUN/tensorboard`.
+Needs the extra `sqn_jax[tensorboard]`. View with `tensorboard --logdir RUN/tensorboard`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FOLDER = "tensorboard"
 
 
 def require_tensorboard() -> None:
-    """Raise ValueError where tensorboardX is not installed."""
+    """Raise ValueError if tensorboardX is not installed."""
     if importlib.util.find_spec("tensorboardX") is None:
         raise ValueError(
             "--tensorboard: tensorboardX is not installed (pip install 'sqn_jax[tensorboard]')"
@@ -33,9 +33,9 @@ class Board:
         """Open a file in `run_dir`/tensorboard.
 
         Args:
-            run_dir: the run's folder.
-            episodes_done: where a resumed run goes on; what an earlier file holds after that is
-                not shown.
+            run_dir: the run folder.
+            episodes_done: episodes of a resumed run so far; later entries of earlier files are not
+                shown.
 
         Raises:
             ValueError: tensorboardX is not installed, or the file cannot be written.
@@ -43,9 +43,9 @@ class Board:
         require_tensorboard()
         from tensorboardX import SummaryWriter
 
-        purged: dict[str, Any] = {"purge_step": episodes_done + 1} if episodes_done else {}
+        purge: dict[str, Any] = {"purge_step": episodes_done + 1} if episodes_done else {}
         try:
-            self._writer = SummaryWriter(str(run_dir / FOLDER), **purged)
+            self._writer = SummaryWriter(str(run_dir / FOLDER), **purge)
         except OSError as error:
             raise ValueError(f"{run_dir / FOLDER}: cannot be written ({error.strerror})") from None
 
@@ -56,18 +56,18 @@ class Board:
         self._writer.close()
 
     def scalars(self, row: Mapping[str, Any]) -> None:
-        """A row of metrics.jsonl, over the episodes; a list becomes a curve for each entry."""
+        """Add a row of metrics.jsonl; of a list, every entry has its own curve."""
         for name, value in row.items():
             if name in ("chunk", "episodes"):
                 continue
-            for place, number in np.ndenumerate(np.asarray(value, np.float64)):
+            for index, number in np.ndenumerate(np.asarray(value, np.float64)):
                 if math.isfinite(number):
-                    tag = "/".join([name, *map(str, place)])
+                    tag = "/".join([name, *map(str, index)])
                     self._writer.add_scalar(tag, number, row["episodes"])
         self._writer.flush()
 
     def picture(self, name: str, png: bytes, episodes: int) -> None:
-        """A PNG picture under the name, after so many episodes."""
+        """Add a PNG picture under a name, after this number of episodes."""
         with Image.open(io.BytesIO(png)) as image:
             pixels = np.asarray(image.convert("RGB"))
         self._writer.add_image(name, pixels, episodes, dataformats="HWC")

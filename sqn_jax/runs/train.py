@@ -1,6 +1,6 @@
-"""A training run or an evaluation as a person starts it: progress, checkpoints, files, figures.
+"""A training run from start to end: progress, checkpoints, metrics, final evaluation, figures.
 
-The numbers come from `train` and `evaluate`; this module decides what is said and written when.
+`training.loop` computes; this module prints, writes and reads.
 """
 
 from __future__ import annotations
@@ -55,33 +55,33 @@ def train_session(
     resume: bool = False,
     num_devices: int | None = None,
     tensorboard: bool = False,
-    go_on: str = "",
+    resume_command: str = "",
 ) -> None:
-    """Train, evaluate and draw, telling the terminal about it.
+    """Train, evaluate, draw, and print progress.
 
     Args:
-        config: the settings; of a resumed run those in its folder, with more episodes perhaps.
-        run_dir: where everything goes.
-        resume: go on from the newest sound checkpoint in `run_dir`; from the beginning if the run
-            was stopped before its first.
+        config: the settings; for a resumed run those in its folder, maybe with more episodes.
+        run_dir: the run folder.
+        resume: resume from the newest sound checkpoint in `run_dir`, or from the beginning if the
+            run was stopped before its first checkpoint.
         num_devices: see `devices.choose`.
-        tensorboard: write metrics and pictures for TensorBoard, too.
-        go_on: what a run that is stopped is gone on with, as the user is told.
+        tensorboard: also write metrics and figures for TensorBoard.
+        resume_command: the command to resume a stopped run with; printed.
 
     Raises:
         ValueError: the map, the folder or the number of devices is unusable, the run does not fit
-            into memory, or tensorboardX is asked for and not installed.
-        Mismatch: the checkpoints are of another run.
+            into memory, or tensorboardX is needed but not installed.
+        Mismatch: the checkpoints belong to another run.
         NotSaved: a checkpoint could not be written.
-        Diverged: the parameters are lost.
-        Interrupted: by a signal; a chunk was finished and saved.
+        Diverged: the run has diverged.
+        Interrupted: a signal stopped the run; the current chunk was finished and saved.
     """
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     program = make_program(env_params, config, mesh)
-    # What is refused up to here leaves nothing behind.
+    # Errors up to here leave no files behind.
     num_bytes = memory_bytes(env_params, program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
     if tensorboard:
@@ -94,34 +94,34 @@ def train_session(
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
         runner = _restored(env_params, program, folder, checkpoints) if resume else None
-        _announce(program, run_dir, num_bytes, go_on)
+        _announce(program, run_dir, num_bytes, resume_command)
         done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        training = _Training(env_params, program, folder, checkpoints, start, go_on)
+        training = _Training(env_params, program, folder, checkpoints, start, resume_command)
         runner = training.run(runner, None if board is None else board.scalars)
         first_map = _first_map(config, occupancy_map)
-        results, drawn = final_evaluation.evaluate(runner, first_map, config, folder)
-        figures = final_evaluation.draw(drawn, first_map, config, folder)
-        if board is not None and figures:
-            _show_figures(board, config, folder)
-    final_evaluation.conclude(results, training.timing, figures, config, folder)
+        results, batches = final_evaluation.evaluate_run(runner, first_map, config, folder)
+        has_figures = final_evaluation.draw_figures(batches, first_map, config, folder)
+        if board is not None and has_figures:
+            _add_figures(board, config, folder)
+    final_evaluation.conclude(results, training.timing, has_figures, config, folder)
 
 
 def _first_map(config: TrainConfig, occupancy_map: OccupancyMap) -> OccupancyMap:
-    """The map to evaluate on: that of the run, or the first of several that lie side by side."""
+    """The map of the final evaluation: that of the run, or the first of several."""
     if occupancy_map.tiles == (1, 1):
         return occupancy_map
     return load_map(config.maps.names[0], robot_radius=config.env.robot_radius)
 
 
-def _show_figures(board: Board, config: TrainConfig, folder: RunFolder) -> None:
-    # Not the hidden ones, which a process that was killed has left behind.
+def _add_figures(board: Board, config: TrainConfig, folder: RunFolder) -> None:
+    # Not the hidden files, which a killed process has left behind.
     for path in sorted(folder.figures.glob("[!.]*.png")):
         board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
 
 
 def _starting_policy(config: TrainConfig) -> Policy | None:
-    """The policy that a run is to start from, if any."""
+    """The policy that training starts from, if any."""
     if not config.start_from:
         return None
     policy = find_policy(config.start_from)
@@ -129,7 +129,7 @@ def _starting_policy(config: TrainConfig) -> Policy | None:
     return policy
 
 
-def _announce(program: Program, run_dir: Path, num_bytes: int, go_on: str) -> None:
+def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: str) -> None:
     config = program.config
     seeds = f"seed {config.seed}"
     if config.num_seeds > 1:
@@ -143,17 +143,17 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, go_on: str) -> No
         f"episodes in memory {num_bytes / 1e6:,.1f} MB"
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
-        print("checkpoints without the replay: a run that is stopped does not go on exactly")
-    if go_on:  # Where a signal ends the process at once, nothing can be said any more.
-        print(f"if it is stopped, go on with {go_on}", flush=True)
+        print("checkpoints without the replay: a stopped run does not resume exactly")
+    if resume_command:  # Later a signal may end the process at once.
+        print(f"if it is stopped, resume with {resume_command}", flush=True)
 
 
 def _restored(
     env_params: EnvParams, program: Program, folder: RunFolder, checkpoints: Checkpoints
 ) -> RunnerState | None:
-    """The state to go on from; None if the run was stopped before its first checkpoint.
+    """The state to resume from; None if the run was stopped before its first checkpoint.
 
-    From here on the folder is that of a run with this config, as far as it has come.
+    Also writes the config to the folder and drops the metrics of chunks after the checkpoint.
     """
     config = program.config
     runner, chunks = None, 0
@@ -164,12 +164,12 @@ def _restored(
             episodes = chunks * config.rounds_per_chunk * config.num_envs
             raise ValueError(
                 f"total_episodes is {config.total_episodes}, expected at least the {episodes} that "
-                f"the run in {folder.path} has behind it"
+                f"the run in {folder.path} has done"
             )
         print(f"resuming after {chunks} of {config.num_chunks} chunks")
-        _compare_makes(saved, 1 if program.mesh is None else program.mesh.size)
+        _report_changes(saved, 1 if program.mesh is None else program.mesh.size)
         if config.method == "r2d2" and runner.learner.memory is None:
-            print("saved without the replay: going on from an empty one, not exactly as before")
+            print("saved without the replay: resuming with an empty one, not exactly as before")
             memory = start_run(env_params, program).learner.memory
             learner = dataclasses.replace(runner.learner, memory=memory)
             runner = dataclasses.replace(runner, learner=learner)
@@ -189,35 +189,38 @@ def _restored(
 
 
 def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
-    """Refuse to start from the beginning where there must have been checkpoints."""
-    place = folder.path / CHECKPOINTS
-    is_odd = os.path.lexists(place) and not place.is_dir()
+    """Refuse to start from the beginning if there must have been checkpoints."""
+    checkpoints = folder.path / CHECKPOINTS
+    is_no_folder = os.path.lexists(checkpoints) and not checkpoints.is_dir()
     if (
-        is_odd
-        or any(place.glob("*.damaged"))
+        is_no_folder
+        or any(checkpoints.glob("*.damaged"))
         or (folder.path / SUMMARY).exists()
         or folder.train_seconds() > 120 * config.checkpoint_minutes
     ):
         raise ValueError(
-            f"{place}: holds no checkpoint that can be used, but the run has been further; put "
+            f"{checkpoints}: holds no checkpoint that can be used, but the run had some; put "
             "them back, or start a new run in another folder"
         )
 
 
-def _compare_makes(saved: Manifest, num_devices: int) -> None:
-    """Say so where another machine or version goes on: the run is then not the same to the bit."""
-    then = {**saved.contents["versions"], "device": saved.contents["device"]}
-    now = {**manifest.versions(), "device": devices.describe()}
-    then["devices"], now["devices"] = str(saved.contents["num_devices"]), str(num_devices)
-    changed = [name for name in ("jax", "device", "devices", "sqn_jax") if then[name] != now[name]]
+def _report_changes(saved: Manifest, num_devices: int) -> None:
+    """Print what has changed of machine and versions; the run is then not the same to the bit."""
+    old = {**saved.contents["versions"], "device": saved.contents["device"]}
+    new = {**manifest.versions(), "device": devices.describe()}
+    old["devices"], new["devices"] = str(saved.contents["num_devices"]), str(num_devices)
+    changed = [name for name in ("jax", "device", "devices", "sqn_jax") if old[name] != new[name]]
     if changed:
-        was = ", ".join(f"{name} {then[name]}" for name in changed)
-        is_now = ", ".join(f"{name} {now[name]}" for name in changed)
-        print(f"saved under {was}; going on under {is_now}: not bit for bit as it would have been")
+        saved_under = ", ".join(f"{name} {old[name]}" for name in changed)
+        resumed_under = ", ".join(f"{name} {new[name]}" for name in changed)
+        print(
+            f"saved under {saved_under}; resuming under {resumed_under}: "
+            "the results will not be the same bit for bit"
+        )
 
 
 class _Training:
-    """Takes a training to its end, with everything that is written on the way."""
+    """The training of a run to its end, with metrics and checkpoints."""
 
     def __init__(
         self,
@@ -226,11 +229,11 @@ class _Training:
         folder: RunFolder,
         checkpoints: Checkpoints,
         start: Policy | None,
-        go_on: str,
+        resume_command: str,
     ) -> None:
         config, mesh = program.config, program.mesh
         self._env_params, self._program, self._config = env_params, program, config
-        self._start, self._go_on = start, go_on
+        self._start, self._resume_command = start, resume_command
         self._folder, self._checkpoints = folder, checkpoints
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
@@ -246,7 +249,7 @@ class _Training:
     def run(
         self, runner: RunnerState | None, on_row: Callable[[dict[str, Any]], None] | None
     ) -> RunnerState:
-        """From a state, or from the beginning, to the end; returns the final state."""
+        """Train from a state, or from the beginning; returns the final state."""
         config = self._config
         done = 0 if runner is None else rounds_done(runner)
         self.timing["env_steps"] = done * self._steps_a_round
@@ -258,26 +261,26 @@ class _Training:
             if self._start is not None:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
-        saving = "stopping after this chunk and saving"
-        with deferred(saving) as received, episodes_bar(total, done * config.num_envs) as bar:
+        message = "stopping after this chunk and saving"
+        with deferred(message) as received, episodes_bar(total, done * config.num_envs) as bar:
             for runner, report in run(runner, self._env_params, self._program, compiled):  # noqa: B020
-                row = self._keep(report)
+                row = self._write_row(report)
                 if on_row is not None:
                     on_row(row)
                 bar.set_postfix_str(_postfix(row), refresh=False)
                 bar.update(config.rounds_per_chunk * config.num_envs)
-                divergence.require_sound(row, runner.learner, config, self._folder)
+                divergence.raise_if_diverged(row, runner.learner, config, self._folder)
                 is_due = time.monotonic() - self._saved_at > 60 * config.checkpoint_minutes
                 if received or is_due or report.chunk == config.num_chunks:
                     self._save(report.chunk, runner)
                 if received:
                     break
         if received:
-            raise Interrupted(received[0], self._go_on)
+            raise Interrupted(received[0], self._resume_command)
         return runner
 
     def _compile(self) -> CompiledChunk:
-        """Compile, and refuse what does not fit."""
+        """Compile a chunk; refuse what does not fit into memory."""
         print("compiling ...", end="", flush=True)
         with watched_compilation() as was_read:
             compiled, seconds = compile_chunk(self._env_params, self._program)
@@ -296,8 +299,8 @@ class _Training:
 
         return run_chunk
 
-    def _keep(self, report: ChunkReport) -> dict[str, Any]:
-        """Count a chunk and write its row."""
+    def _write_row(self, report: ChunkReport) -> dict[str, Any]:
+        """Update the timing by a chunk, and write its row of metrics."""
         self.timing["train_seconds"] += report.seconds
         self.timing["env_steps"] += self._config.rounds_per_chunk * self._steps_a_round
         self._successes.append(float(np.mean(report.metrics["success"])))
@@ -306,7 +309,7 @@ class _Training:
         return row
 
     def _save(self, chunk: int, runner: RunnerState) -> None:
-        """Write a checkpoint, and what its rows say for good."""
+        """Write a checkpoint; its rows of metrics are flushed to the disk before."""
         self._folder.flush_metrics()
         score = float(np.mean(self._successes))
         light = not self._config.checkpoint_replay

@@ -17,15 +17,14 @@ import pytest
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, TrainConfig
-from sqn_jax.evaluation.compare import (
-    Learnt,
-    Reference,
-    Settings,
+from sqn_jax.evaluation.agents import (
+    BaselineAgent,
+    TrainedAgent,
     group_policies,
-    load_maps,
-    num_episodes,
-    with_references,
+    with_baselines,
 )
+from sqn_jax.evaluation.compare import load_maps, num_episodes
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import (
     OccupancyMap,
     goal_distance,
@@ -125,10 +124,10 @@ def test_runs_that_differ_in_their_seeds_are_one_agent() -> None:
         group_policies([run("a", seed=3), run("b", seed=2, num_seeds=2)])
 
 
-def test_references_have_the_robot_of_the_first_agent() -> None:
+def test_baselines_have_the_robot_of_the_first_agent() -> None:
     config = TrainConfig()
     narrow = dataclasses.replace(config, env=dataclasses.replace(config.env, robot_radius=0.05))
-    agents = with_references([Learnt("sqn", (Policy("a", narrow, ({},)),))], references=True)
+    agents = with_baselines([TrainedAgent("sqn", (Policy("a", narrow, ({},)),))], baselines=True)
     assert [agent.name for agent in agents] == ["sqn", "bug", "oracle"]
     assert all(agent.env_config.robot_radius == 0.05 for agent in agents)
     assert num_episodes(agents, Settings(maps=("maze", "cave"), episodes=7)) == 3 * 2 * 5 * 7
@@ -174,10 +173,10 @@ def test_a_map_is_judged_by_each_robot_s_own_radius(tmp_path: Path) -> None:
     save_map(
         OccupancyMap("gap", occupied, 0.05, points, points, max_steps=50), tmp_path / "gap.yaml"
     )
-    agents = [Reference("bug", EnvConfig(robot_radius=radius)) for radius in (0.1, 0.05)]
+    agents = [BaselineAgent("bug", EnvConfig(robot_radius=radius)) for radius in (0.1, 0.05)]
     settings = Settings(maps=(str(tmp_path / "gap.yaml"),), episodes=1)
     assert set(load_maps(agents, settings)) == {(settings.maps[0], 0.1), (settings.maps[0], 0.05)}
-    agents.append(Reference("bug", EnvConfig(robot_radius=0.2)))
+    agents.append(BaselineAgent("bug", EnvConfig(robot_radius=0.2)))
     with pytest.raises(ValueError, match="gap"):
         load_maps(agents, settings)
 

@@ -16,17 +16,11 @@ from rooms import random_params, small_room, write_empty_room
 from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, coverage, step
-from sqn_jax.evaluation.compare import (
-    EpisodeBatch,
-    Learnt,
-    Settings,
-    World,
-    evaluate_agents,
-    load_maps,
-)
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.compare import evaluate_agents, load_maps
 from sqn_jax.evaluation.episodes import episode_keys
 from sqn_jax.evaluation.recording import Episode, record, record_episodes
-from sqn_jax.evaluation.settings import task_key
+from sqn_jax.evaluation.settings import Settings, World, task_key
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy
 
@@ -64,9 +58,9 @@ def episodes(world: World, params: Any) -> list[Episode]:
     return record_episodes(keys, agent_of(params), 0, world)
 
 
-def agent_of(*params: Any) -> Learnt:
+def agent_of(*params: Any) -> TrainedAgent:
     config = TrainConfig(algo="sqn", network=CONFIG, num_seeds=len(params))
-    return Learnt("sqn", (Policy("made up", config, params),))
+    return TrainedAgent("sqn", (Policy("made up", config, params),))
 
 
 def test_each_step_is_the_one_that_the_simulator_makes(
@@ -170,7 +164,7 @@ def test_a_recorded_episode_is_the_evaluated_one_to_the_bit(
     policy = Policy("made up", config, tuple(random_params(NETWORK, room, seed) for seed in (0, 1)))
     settings = Settings((str(path),), ("random pairs",), 7, 2, 77, (noise,), max_steps=40)
     batches: list[EpisodeBatch] = []
-    agents = [Learnt("sqn", (policy,))]
+    agents = [TrainedAgent("sqn", (policy,))]
     fields = ("actions", "rewards", "info", "output")
     maps = load_maps(agents, settings)
     evaluate_agents(agents, maps, settings, on_evaluated=batches.append, fields=fields)

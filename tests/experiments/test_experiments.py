@@ -11,7 +11,7 @@ import jax
 import pytest
 
 from experiments import bench_simulator, benchmark, common, robustness, table1
-from sqn_jax.evaluation.compare import Settings
+from sqn_jax.evaluation.settings import Settings
 
 TOLD = {"mean": 0.5, "std": 0.5, "ci95": [0.4, 0.6], "std_of_means": 0.025}
 STEPS = {"mean": 250.0, "std": 9.0, "ci95": [240.0, 260.0], "std_of_means": 4.0}

@@ -50,8 +50,8 @@ def test_the_scale_has_two_ends_with_a_light_middle_and_paths_a_dark_edge() -> N
     (axes,) = panels(figures.skill_trajectories([one], title="SQN"))
     (path,) = drawn_paths(axes)
     colours = path.get_cmap()(np.linspace(0, 1, 255))[:, :3]
-    np.testing.assert_allclose(colours[0], to_rgb(style.COLOURS[1]), atol=0.01)
-    np.testing.assert_allclose(colours[-1], to_rgb(style.COLOURS[0]), atol=0.01)
+    np.testing.assert_allclose(colours[0], to_rgb(style.COLORS[1]), atol=0.01)
+    np.testing.assert_allclose(colours[-1], to_rgb(style.COLORS[0]), atol=0.01)
     luma = colours @ [0.299, 0.587, 0.114]
     assert 110 < luma.argmax() < 144
     (edge,) = [line for line in axes.lines if len(line.get_xdata()) > 2]
@@ -65,7 +65,7 @@ def test_more_than_two_skills_have_the_colour_of_the_largest_weight() -> None:
     one = episode(skills=3)
     figure = figures.skill_trajectories([one], title="K = 3")
     (axes,) = figure.axes  # and no scale
-    expected = [to_rgb(style.COLOURS[int(np.argmax(w))]) for w in one.skill_weights[:12]]
+    expected = [to_rgb(style.COLORS[int(np.argmax(w))]) for w in one.skill_weights[:12]]
     assert len(set(expected)) == 3
     assert [to_rgb(colour) for colour in drawn_paths(axes)[0].get_colors()] == expected
     names = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -76,7 +76,7 @@ def test_agents_without_skills_have_one_colour_that_is_no_skills() -> None:
     figure = figures.skill_trajectories([episode(skills=1)], title="R2D2")
     (axes,) = figure.axes
     (colour,) = {to_rgb(colour) for colour in drawn_paths(axes)[0].get_colors()}
-    assert colour not in {to_rgb(skill) for skill in style.COLOURS[:2]}
+    assert colour not in {to_rgb(skill) for skill in style.COLORS[:2]}
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["start", "goal", "agent without skills"]
 

@@ -57,7 +57,7 @@ def test_the_weights_are_stacked_to_one_from_the_first_skill_on() -> None:
         below = one.skill_weights[7, :skill].sum()
         for height in (below, below + one.skill_weights[7, skill]):
             assert np.abs(inside - height).min() < 1e-6
-        assert to_rgb(area.get_facecolor()[0]) == to_rgb(style.COLOURS[skill])
+        assert to_rgb(area.get_facecolor()[0]) == to_rgb(style.COLORS[skill])
     assert weights.get_ylim() == (0.0, 1.0)
 
 

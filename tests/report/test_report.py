@@ -25,13 +25,14 @@ from sqn_jax.cli import main
 from sqn_jax.config import Algorithm, EnvConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import make_env
-from sqn_jax.evaluation.compare import EpisodeBatch, Learnt, Settings, World
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.settings import Settings, World
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report import read_runs
 from sqn_jax.report.content import Content, Run, changed_settings
-from sqn_jax.report.episodes import HardEpisode, Place, densest_place, hardest
-from sqn_jax.report.page import lead, success_table, to_html, words
+from sqn_jax.report.episodes import Place, WorstEpisode, densest_place, worst_episodes
+from sqn_jax.report.page import describe_episode, lead, success_table, to_html
 from sqn_jax.report.pictures import Illustration, Illustrations, curves
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
@@ -128,7 +129,7 @@ def batch_of(
     steps = np.array([step or length for step in reached])
     metrics = EpisodeMetrics(np.array(reached) > 0, steps, *[np.zeros(count)] * 4)
     refused = np.repeat(np.arange(length)[:, None] % 3 == 2, count, axis=1)
-    agent = Learnt("sqn", (Policy("a", TrainConfig(seed=4), ({},)),))
+    agent = TrainedAgent("sqn", (Policy("a", TrainConfig(seed=4), ({},)),))
     weights: Any = np.full((length, count, 2), 0.5)
     return EpisodeBatch(
         agent=agent,
@@ -182,15 +183,17 @@ def test_failures_are_ranked_by_the_way_around_the_wall_not_through_it() -> None
         batch_of(world, [arrived, at_hand], [goal] * 2, [8, 0]),
         batch_of(world, [far_but_open, behind_the_wall], [goal] * 2, [0, 0]),
     ]
-    found = hardest(batches)
+    found = worst_episodes(batches)
     assert [(hard.batch is batches[1], hard.episode) for hard in found] == [
         (True, 1),
         (True, 0),
         (False, 1),
     ]
-    assert found[0].left > 15
-    assert [hard.left for hard in found[1:]] == pytest.approx([6.0, 1.0], abs=0.1)
-    assert [hard.way for hard in found] == pytest.approx([4.0, found[1].way, 8.0], abs=0.1)
+    assert found[0].remaining_path > 15
+    assert [hard.remaining_path for hard in found[1:]] == pytest.approx([6.0, 1.0], abs=0.1)
+    assert [hard.shortest_path for hard in found] == pytest.approx(
+        [4.0, found[1].shortest_path, 8.0], abs=0.1
+    )
 
 
 def test_too_few_failures_are_followed_by_the_slowest_beside_their_way() -> None:
@@ -199,24 +202,24 @@ def test_too_few_failures_are_followed_by_the_slowest_beside_their_way() -> None
     # 2.5 m a second and 0.1 s: 0.25 m a step. 5 m are 20 steps, 2 m are 8.
     paths = [line((6.05, 3.05), goal, 60), line((3.05, 3.05), goal, 60)]
     batch = batch_of(world, [*paths, paths[0], paths[1]], [goal] * 4, [40, 32, 0, 12])
-    found = hardest([batch])
+    found = worst_episodes([batch])
     assert [hard.episode for hard in found] == [2, 1, 0]
     assert [hard.success for hard in found] == [False, True, True]
     assert found[1].slowness == pytest.approx(32 / 8, rel=0.02)
     assert found[2].slowness == pytest.approx(40 / 20, rel=0.02)
-    assert len(hardest([batch], count=9)) == 4
-    assert [hard.left for hard in found] == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
+    assert len(worst_episodes([batch], count=9)) == 4
+    assert [hard.remaining_path for hard in found] == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
 
 
 def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() -> None:
     world = world_of(hall())
     # 12 steps, the last six of which: four at (8, 1), then away by 2 m. Before, all at (2, 1).
     path = [(2.04, 1.04)] * 7 + [(8.04, 1.04)] * 4 + [(6.04, 1.04)] * 2
-    (hard,) = hardest([batch_of(world, [path], [(9.04, 1.04)], [0])])
-    told = words(hard)
+    (hard,) = worst_episodes([batch_of(world, [path], [(9.04, 1.04)], [0])])
+    told = describe_episode(hard)
     assert "not reached within 12 steps" in told
     assert "stuck: it spent 4 of the last 6 steps within 1 m of (8.0, 1.0) m" in told
-    assert "3.0 m of way were left, of 7.0 m from the start" in told
+    assert "shortest path to the goal was 7.0 m from the start and 3.0 m from the end" in told
     assert "from (2.0, 1.0) m to the goal at (9.0, 1.0) m" in told
     assert "4 moves were refused" in told
     assert "sqn, training seed 4, on hall (evaluation points, episode 0" in told
@@ -225,17 +228,17 @@ def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() ->
 def test_a_robot_that_was_nowhere_for_long_is_not_called_stuck() -> None:
     world = world_of(hall())
     path = line((1.05, 1.05), (8.65, 1.05), 8)
-    (hard,) = hardest([batch_of(world, [path], [(1.05, 3.05)], [0])])
+    (hard,) = worst_episodes([batch_of(world, [path], [(1.05, 3.05)], [0])])
     # The last four lie 0.95 m apart: the two in the middle have one neighbour on each side.
-    assert "stuck: it spent 3 of the last 4 steps" in words(hard)
+    assert "stuck: it spent 3 of the last 4 steps" in describe_episode(hard)
     swift = dataclasses.replace(hard, place=Place(6.0, 1.0, 1, 4))
-    assert "stuck nowhere for long: at most it spent 1 of the last 4" in words(swift)
+    assert "stuck nowhere for long: at most it spent 1 of the last 4" in describe_episode(swift)
 
 
 def test_of_a_success_only_the_way_to_the_goal_counts() -> None:
     world = world_of(hall())
     path = [(2.05, 1.05)] * 4 + [(8.05, 1.05)] * 9  # Reached at step 4, where it stays.
-    (hard,) = hardest([batch_of(world, [path], [(8.05, 1.05)], [4])])
+    (hard,) = worst_episodes([batch_of(world, [path], [(8.05, 1.05)], [4])])
     assert (hard.place.steps, hard.place.of) == (3, 4)
     assert hard.place.x == pytest.approx(2.05)
     assert hard.refused == 1  # The third move; the others came after the arrival.
@@ -293,9 +296,9 @@ def evil_content() -> Content:
     """A content in which every name is hostile."""
     policy = Policy(EVIL, dataclasses.replace(TrainConfig(), map=EVIL), ({},))
     run = Run(EVIL, policy, [], {"device": EVIL, "versions": {EVIL: EVIL}})
-    agent = Learnt(EVIL, (policy,))
+    agent = TrainedAgent(EVIL, (policy,))
     batch = batch_of(world_of(hall(EVIL)), [line((1.05, 1.05), (2, 1), 4)], [(9.05, 1.05)], [0])
-    hard = HardEpisode(dataclasses.replace(batch, agent=agent), 0, 8.0, 7.0, Place(2.0, 1.0, 2, 2))
+    hard = WorstEpisode(dataclasses.replace(batch, agent=agent), 0, 8.0, 7.0, Place(2.0, 1.0, 2, 2))
     results = [entry(EVIL, EVIL, 0.5, 100.0)]
     settings = Settings(maps=(EVIL,), eval_seeds=1)
     return Content([run], [agent], settings, {"results": results}, [hard.batch], [hard])
@@ -320,7 +323,7 @@ def test_hostile_names_are_text_and_nothing_else() -> None:
 def test_the_first_sentence_tells_success_and_steps_of_each_map() -> None:
     content = dataclasses.replace(
         evil_content(),
-        agents=[Learnt("sqn", ())],
+        agents=[TrainedAgent("sqn", ())],
         evaluation={"results": RESULTS},
         settings=Settings(maps=("maze", "hall")),
     )
@@ -403,7 +406,7 @@ def test_one_run_has_its_curves_several_are_compared_and_one_without_metrics_has
         return Run(name, Policy(name, TrainConfig(algo=algo), ({},)), metrics, {})
 
     def count(*runs: Run) -> int:
-        agents = [Learnt(run.policy.config.algo, (run.policy,)) for run in runs]
+        agents = [TrainedAgent(run.policy.config.algo, (run.policy,)) for run in runs]
         found = curves(dataclasses.replace(evil_content(), runs=list(runs), agents=agents))
         assert all(each.data.startswith(b"\x89PNG") for each in found)
         return len(found)

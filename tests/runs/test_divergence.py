@@ -13,7 +13,7 @@ import pytest
 
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.config import TrainConfig
-from sqn_jax.runs.divergence import DUMP, Diverged, require_sound
+from sqn_jax.runs.divergence import DUMP, Diverged, raise_if_diverged
 from sqn_jax.storage.run_folder import RunFolder
 
 CONFIG = TrainConfig(seed=4, max_skipped_updates=3)
@@ -39,15 +39,15 @@ def row(skipped: Any, finite: Any) -> dict[str, Any]:
 
 
 def test_a_few_skipped_updates_are_let_pass(tmp_path: Path) -> None:
-    require_sound(row(3, True), learner(1.0), CONFIG, RunFolder(tmp_path))
+    raise_if_diverged(row(3, True), learner(1.0), CONFIG, RunFolder(tmp_path))
     seeds = dataclasses.replace(CONFIG, num_seeds=2)
-    require_sound(row([0, 3], [True, True]), learner(1.0), seeds, RunFolder(tmp_path))
+    raise_if_diverged(row([0, 3], [True, True]), learner(1.0), seeds, RunFolder(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_too_many_are_not(tmp_path: Path) -> None:
     with pytest.raises(Diverged, match=r"chunk 7, seed 4: 4 of 10 updates .* \(3\)"):
-        require_sound(row(4, True), learner(1.0), CONFIG, RunFolder(tmp_path))
+        raise_if_diverged(row(4, True), learner(1.0), CONFIG, RunFolder(tmp_path))
 
 
 def test_parameters_that_are_no_numbers_are_named_with_the_worst_first(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_parameters_that_are_no_numbers_are_named_with_the_worst_first(tmp_path:
         folder.append_metrics({"chunk": chunk})
     found = learner(-5.0, np.nan, np.inf)
     with pytest.raises(Diverged, match=r"seed 4: parameters are no longer finite; .*"):
-        require_sound(row(0, False), found, CONFIG, folder)
+        raise_if_diverged(row(0, False), found, CONFIG, folder)
     told = json.loads((tmp_path / DUMP).read_text())
     assert list(told["arrays"]) == ["params/b", "params/a/kernel", "opt_state/mu"]
     assert told["arrays"]["params/b"] == {"largest": 5.0, "not_finite": 2, "of": 3}
@@ -73,7 +73,7 @@ def test_of_several_seeds_the_lost_ones_are_named(tmp_path: Path) -> None:
         opt_state={"mu": jnp.zeros((3, 1))},
     )
     with pytest.raises(Diverged, match="seed 6: parameters are no longer finite"):
-        require_sound(row([0, 0, 0], [True, True, False]), several, config, RunFolder(tmp_path))
+        raise_if_diverged(row([0, 0, 0], [True, True, False]), several, config, RunFolder(tmp_path))
     told = json.loads((tmp_path / DUMP).read_text())
     assert told["seeds"] == [6]
     assert told["arrays"]["params/b"] == {"largest": 0.0, "not_finite": 1, "of": 1}

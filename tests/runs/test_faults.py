@@ -103,7 +103,7 @@ def assert_stopped(runs: TinyRuns, run: str, number: int, code: int, err: str) -
 
 
 def go_on(runs: TinyRuns, run: str) -> str:
-    return f"go on with `sqn train --run-dir {runs.folder / run} --resume --num-devices 1`"
+    return f"resume with `sqn train --run-dir {runs.folder / run} --resume --num-devices 1`"
 
 
 def end_at_once(process: subprocess.Popen[str], upon: str, number: signal.Signals) -> str:
@@ -313,7 +313,7 @@ def test_a_run_without_its_replay_goes_on_and_says_it_is_not_the_same(
     assert not list((tmp_path / "light" / "checkpoints" / "4").glob("memory*"))
     code, out, err = runs.call("light", resume=True)
     assert code == 0, err
-    assert "going on from an empty one, not exactly as before" in out
+    assert "resuming with an empty one, not exactly as before" in out
     updates = [row["updates"] for row in runs.rows("light")]
     assert updates == [0, 1, 2, 3, 3, 4]  # The replay has to fill again.
 

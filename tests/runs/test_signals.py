@@ -128,7 +128,7 @@ def test_a_chunk_is_waited_for_and_the_user_told_at_once(number: signal.Signals)
         assert child.runs()
         status, out, err = child.end()
         assert (status, out) == (128 + number, "saved\n")
-        assert err == f"stopped by {number.name} after saving, go on with this command\n"
+        assert err == f"stopped by {number.name} after saving, resume with this command\n"
 
 
 @linux
@@ -213,5 +213,5 @@ def test_afterwards_signals_are_what_they_were(capfd: pytest.CaptureFixture[str]
 def test_who_was_interrupted_says_by_what_and_how_to_go_on() -> None:
     stop = Interrupted(signal.SIGTERM, "`this`")
     assert stop.exit_code == 143
-    assert str(stop) == "stopped by SIGTERM after saving, go on with `this`"
+    assert str(stop) == "stopped by SIGTERM after saving, resume with `this`"
     assert str(Interrupted(signal.SIGINT)) == "stopped by SIGINT after saving"
