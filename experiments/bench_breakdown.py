@@ -43,13 +43,13 @@ def motion(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState,
 
 
 def rays(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
-    """Drive and look."""
+    """Move and look."""
     state, _ = motion(state, action, params)
     return state, true_ranges(state.pose, params)
 
 
 def rays_and_coverage(state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Any]:
-    """Drive, look, and mark what is seen."""
+    """Move, look, and mark what is seen."""
     state, ranges = rays(state, action, params)
     covered, fresh = coverage.add_scan(
         state.covered,
@@ -78,11 +78,13 @@ def piece_program(piece: Piece, params: EnvParams, num_envs: int, num_steps: int
     actions, _ = draw_actions(action_key, step_key, num_steps, num_envs)
 
     @jax.jit
-    def drive(states: EnvState, actions: Array, params: EnvParams) -> Any:
-        one = jax.vmap(piece, in_axes=(0, 0, None))
-        return jax.lax.scan(lambda states, action: one(states, action, params), states, actions)
+    def rollout(states: EnvState, actions: Array, params: EnvParams) -> Any:
+        one_step = jax.vmap(piece, in_axes=(0, 0, None))
+        return jax.lax.scan(
+            lambda states, action: one_step(states, action, params), states, actions
+        )
 
-    return lambda turn: drive(states, actions, params)
+    return lambda turn: rollout(states, actions, params)
 
 
 def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Timed]:

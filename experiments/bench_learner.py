@@ -278,31 +278,31 @@ def measure(
             suffix = "" if mesh is None else f", {mesh.size} devices"
             programs[algo, JAX + suffix] = drawn_program(problem, mesh)
             programs[algo, SAMPLING + suffix] = sampling_program(problem, mesh)
-    told: dict[str, Any] = {"updates_in_a_call": num_updates, "products_size": product_size}
+    results: dict[str, Any] = {"updates_in_a_call": num_updates, "products_size": product_size}
     if torch_threads:
         programs |= torch_programs(problems.get("sqn"), torch_threads, product_size)
         if "sqn" in problems:
-            told["torch_td_error_difference"] = torch_difference(problems["sqn"])
+            results["torch_td_error_difference"] = torch_difference(problems["sqn"])
     timings = time_in_turns(programs, repeats)
     rates = {
         program: 2 * product_size**3 / timing.median / 1e9
         for (what, program), timing in timings.items()
         if what == PRODUCT
     }
-    told["products_gflops"] = {program: four_digits(rate) for program, rate in rates.items()}
-    told["updates"] = [
+    results["products_gflops"] = {program: four_digits(rate) for program, rate in rates.items()}
+    results["updates"] = [
         _entry(problems[algo], program, timings[algo, program], max(rates.values()))
         for algo in problems
         for what, program in timings
         if what == algo
     ]
-    return told
+    return results
 
 
 def _entry(
     problem: Problem, program: str, timing: Timing, products_gflops: float
 ) -> dict[str, Any]:
-    """What is told of one agent and program."""
+    """The entry of one agent and program."""
     config, obs = problem.program.config, problem.episodes.obs
     num_updates, num_steps, batch_size = problem.episodes.actions.shape
     operations = update_operations(
@@ -329,14 +329,14 @@ def _entry(
     }
 
 
-def table(told: dict[str, Any]) -> str:
+def table(results: dict[str, Any]) -> str:
     """Updates, the share of the products' best rate, and times as fast as PyTorch at its best."""
     base: dict[str, float] = {}
-    for entry in told["updates"]:
+    for entry in results["updates"]:
         if entry["program"].startswith("PyTorch"):
             base[entry["algo"]] = min(entry["milliseconds"], base.get(entry["algo"], float("inf")))
     rows = []
-    for entry in told["updates"]:
+    for entry in results["updates"]:
         algo, milliseconds = entry["algo"], entry["milliseconds"]
         row = [algo, entry["program"], f"{milliseconds:.0f}", f"{entry['updates_per_second']:.3g}"]
         row += [f"{entry['operations'] / 1e9:.1f}", f"{entry['gflops']:.1f}"]

@@ -23,23 +23,23 @@ from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset, step
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.training import devices
 
-Drive = Callable[[Array, Any, int], Any]
+Rollout = Callable[[Array, Any, int], Any]
 """Takes a key, what a world is made of, and a number of robots N; returns arrays [T, N, ...]."""
 
 
-def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Timed:
-    """Robots on one device, or as many on each of several, with chance of their own."""
+def program(rollout: Rollout, world: Any, num_envs: int, mesh: Mesh | None) -> Timed:
+    """Robots on one device, or as many on each of several, with random draws of their own."""
     if mesh is None:
-        alone = jax.jit(drive, static_argnums=2)
+        alone = jax.jit(rollout, static_argnums=2)
         return lambda turn: alone(jax.random.key(turn), world, num_envs)
 
-    def share(key: Array, world: Any) -> Any:
+    def on_one_device(key: Array, world: Any) -> Any:
         own_key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
-        return drive(own_key, world, num_envs // mesh.size)
+        return rollout(own_key, world, num_envs // mesh.size)
 
     together = jax.jit(
         jax.shard_map(
-            share,
+            on_one_device,
             mesh=mesh,
             in_specs=(PartitionSpec(), PartitionSpec()),
             out_specs=PartitionSpec(None, AXIS),
@@ -50,20 +50,20 @@ def program(drive: Drive, world: Any, num_envs: int, mesh: Mesh | None) -> Timed
     return lambda turn: together(jax.random.key(turn), placed)
 
 
-def drive_ours(key: Array, params: EnvParams, num_envs: int, *, num_steps: int) -> Any:
+def rollout_ours(key: Array, params: EnvParams, num_envs: int, *, num_steps: int) -> Any:
     """Observations and rewards of robots with random actions."""
     start_key, action_key, step_key = jax.random.split(key, 3)
     _, states = jax.vmap(reset, in_axes=(0, None))(jax.random.split(start_key, num_envs), params)
 
-    def body(states: Any, chance: tuple[Array, Array]) -> tuple[Any, Any]:
-        actions, keys = chance
+    def body(states: Any, draws: tuple[Array, Array]) -> tuple[Any, Any]:
+        actions, keys = draws
         obs, states, reward, _, _, info = jax.vmap(step, in_axes=(0, 0, 0, None))(
             keys, states, actions, params
         )
         return states, (obs, reward, info["reached"])
 
-    chance = draw_actions(action_key, step_key, num_steps, num_envs)
-    return jax.lax.scan(body, states, chance)[1]
+    draws = draw_actions(action_key, step_key, num_steps, num_envs)
+    return jax.lax.scan(body, states, draws)[1]
 
 
 def draw_actions(
@@ -75,7 +75,7 @@ def draw_actions(
     return actions, jax.random.split(step_key, shape)
 
 
-def jaxnav(num_steps: int, *, resets: bool) -> Drive | None:
+def jaxnav(num_steps: int, *, resets: bool) -> Rollout | None:
     """The same for JaxNav, whose world is its own; None where it is not installed."""
     try:
         from jaxmarl.environments.jaxnav import JaxNav
@@ -84,39 +84,39 @@ def jaxnav(num_steps: int, *, resets: bool) -> Drive | None:
     world = JaxNav(num_agents=1, act_type="Discrete", lidar_num_beams=71, lidar_max_range=5.0)
     advance = world.step if resets else world.step_env
 
-    def drive(key: Array, _: Any, num_envs: int) -> Any:
+    def rollout(key: Array, _: Any, num_envs: int) -> Any:
         start_key, action_key, step_key = jax.random.split(key, 3)
         _, states = jax.vmap(world.reset)(jax.random.split(start_key, num_envs))
 
-        def body(states: Any, chance: tuple[Array, Array]) -> tuple[Any, Any]:
-            actions, keys = chance
+        def body(states: Any, draws: tuple[Array, Array]) -> tuple[Any, Any]:
+            actions, keys = draws
             obs, states, reward, *_ = jax.vmap(advance)(keys, states, {"agent_0": actions})
             return states, (obs["agent_0"], reward["agent_0"])
 
-        chance = draw_actions(action_key, step_key, num_steps, num_envs)
-        return jax.lax.scan(body, states, chance)[1]
+        draws = draw_actions(action_key, step_key, num_steps, num_envs)
+        return jax.lax.scan(body, states, draws)[1]
 
-    return drive
+    return rollout
 
 
 def programs(
     maps: Sequence[str], counts: Sequence[int], num_steps: int
 ) -> dict[tuple[str, int], Timed]:
     """What is timed, by name and number of robots."""
-    ours = partial(drive_ours, num_steps=num_steps)
-    drives: dict[str, tuple[Drive | None, Any]] = {
+    ours = partial(rollout_ours, num_steps=num_steps)
+    rollouts: dict[str, tuple[Rollout | None, Any]] = {
         f"sqn_jax, {name}": (ours, make_env(name)) for name in maps
     }
     for resets, name in ((False, "JaxNav"), (True, "JaxNav, reset in every step")):
-        drives[name] = (jaxnav(num_steps, resets=resets), None)
-    found: dict[tuple[str, int], Timed] = {}
-    for name, (drive, world) in drives.items():
+        rollouts[name] = (jaxnav(num_steps, resets=resets), None)
+    timed: dict[tuple[str, int], Timed] = {}
+    for name, (rollout, world) in rollouts.items():
         for mesh in devices.one_and_all():
             for count in counts:
-                if drive is not None and (mesh is None or count % mesh.size == 0):
-                    told = name if mesh is None else f"{name}, {mesh.size} devices"
-                    found[told, count] = program(drive, world, count, mesh)
-    return found
+                if rollout is not None and (mesh is None or count % mesh.size == 0):
+                    label = name if mesh is None else f"{name}, {mesh.size} devices"
+                    timed[label, count] = program(rollout, world, count, mesh)
+    return timed
 
 
 def measure(
@@ -151,7 +151,7 @@ def table(entries: Sequence[dict[str, Any]]) -> str:
     rows = []
     for entry in entries:
         ratio = entry["steps_per_second"] / base.get(entry["num_envs"], float("nan"))
-        told = f"{ratio:.1f}" if entry["num_envs"] in base else "-"
+        ratio_text = f"{ratio:.1f}" if entry["num_envs"] in base else "-"
         speed = f"{entry['steps_per_second']:,}"
-        rows.append([entry["program"], str(entry["num_envs"]), speed, told])
+        rows.append([entry["program"], str(entry["num_envs"]), speed, ratio_text])
     return markdown_table(["program", "robots", "steps a second", "times JaxNav"], rows)

@@ -6,7 +6,7 @@
 R2D2 updates of the preset `paper`, beside PyTorch and beside the machine's rate of matrix products
 (`bench_learner.py`). `train`: the compiled training program of a preset (`bench_train.py`).
 `breakdown`: the pieces of a step and of a training window (`bench_breakdown.py`). What is compared
-takes turns; told are medians. `.venv/bin/python -m pip install -e ".[bench]"` installs JaxNav and
+takes turns; times are medians. `.venv/bin/python -m pip install -e ".[bench]"` installs JaxNav and
 PyTorch.
 """
 
@@ -45,18 +45,18 @@ def learner(options: argparse.Namespace) -> dict[str, Any]:
     missing = bench_learner.missing_torch()
     if missing:
         print(missing, end="\n\n")
-    told = bench_learner.measure(
+    results = bench_learner.measure(
         config,
         make_env(config.map, config.env),
         options.algos,
         options.repeats,
         torch_threads=() if missing else options.torch_threads,
     )
-    size = told["products_size"]
-    rates = "; ".join(f"{name}: {rate:.0f}" for name, rate in told["products_gflops"].items())
-    print(bench_learner.table(told))
+    size = results["products_size"]
+    rates = "; ".join(f"{name}: {rate:.0f}" for name, rate in results["products_gflops"].items())
+    print(bench_learner.table(results))
     print(f"\nGFLOP/s in products of float32 matrices [{size}, {size}]: {rates}", end="\n\n")
-    return {"learner": told}
+    return {"learner": results}
 
 
 def training(options: argparse.Namespace) -> dict[str, Any]:
@@ -80,16 +80,16 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def memory() -> dict[str, Any]:
-    """Tell what the preset `paper` keeps in memory, and what this process held at most."""
+    """Print what the preset `paper` keeps in memory, and what this process held at most."""
     config = PRESETS["paper"]
-    told = bench_train.memory(config, make_env(config.map, config.env))
-    megabytes = {name: value / 1e6 for name, value in told.items() if name.endswith("bytes")}
+    sizes = bench_train.memory(config, make_env(config.map, config.env))
+    megabytes = {name: value / 1e6 for name, value in sizes.items() if name.endswith("bytes")}
     print(
         f"Preset paper: {megabytes['replay_bytes']:.0f} MB for a replay of "
-        f"{told['replay_episodes']:,} episodes, {megabytes['run_bytes']:.0f} MB with those of a "
+        f"{sizes['replay_episodes']:,} episodes, {megabytes['run_bytes']:.0f} MB with those of a "
         f"round. This process held {megabytes['peak_process_bytes']:.0f} MB at most."
     )
-    return {"memory": told}
+    return {"memory": sizes}
 
 
 def machine() -> dict[str, Any]:
@@ -149,13 +149,13 @@ def main() -> None:
         "train": training,
         "breakdown": breakdown,
     }
-    told = machine()
+    results = machine()
     for part in PARTS:
         if part in options.parts:
-            told |= measures[part](options)
-    told |= memory()
+            results |= measures[part](options)
+    results |= memory()
     if options.out is not None:
-        write_json(options.out, told)
+        write_json(options.out, results)
 
 
 if __name__ == "__main__":

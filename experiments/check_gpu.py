@@ -27,21 +27,21 @@ ROBOTS, STEPS = 512, 100
 SIZES = ((1, 391, 64), (5, 391, 64), (1, 100, 16), (5, 100, 16))
 """Seeds, steps and robots of a minibatch: of the presets `paper` and `quick`."""
 HIDDEN = 128
-TOLD = ("ranges", "goal", "reward", "pose", "covered_area", "collision")
+QUANTITIES = ("ranges", "goal", "reward", "pose", "covered_area", "collision")
 
 
-def drive(params: EnvParams, keys: Array, actions: Array) -> tuple[Array, ...]:
-    """What robots [N] see and get for actions [T, N]: arrays [T, N, ...] in the order of TOLD."""
+def rollout(params: EnvParams, keys: Array, actions: Array) -> tuple[Array, ...]:
+    """What robots [N] see and get for actions [T, N]: [T, N, ...], in the order of QUANTITIES."""
     _, states = jax.vmap(reset, in_axes=(0, None))(keys, params)
 
     def advance(states: Any, taken: Array) -> Any:
-        one = jax.vmap(step, in_axes=(0, 0, 0, None))
-        obs, states, reward, _, _, info = one(keys, states, taken, params)
+        step_all = jax.vmap(step, in_axes=(0, 0, 0, None))
+        obs, states, reward, _, _, info = step_all(keys, states, taken, params)
         area, refused = info["covered_area"], info["collision"]
         return states, (obs.ranges, obs.goal, reward, states.pose, area, refused)
 
-    told: tuple[Array, ...] = jax.lax.scan(advance, states, actions)[1]
-    return told
+    outputs: tuple[Array, ...] = jax.lax.scan(advance, states, actions)[1]
+    return outputs
 
 
 def compare_simulators(map_name: str) -> dict[str, Any]:
@@ -54,13 +54,13 @@ def compare_simulators(map_name: str) -> dict[str, Any]:
     actions = jax.random.randint(jax.random.key(2), (STEPS, ROBOTS), 0, NUM_ACTIONS)
     given = (make_env(map_name), keys, actions)
     here, there = (
-        [np.asarray(x, np.float64) for x in jax.jit(drive)(*jax.device_put(given, device))]
+        [np.asarray(x, np.float64) for x in jax.jit(rollout)(*jax.device_put(given, device))]
         for device in (jax.devices("cpu")[0], jax.devices()[0])
     )
     moved = np.abs(here[3] - there[3]).max(axis=-1) < 1e-3
     together = np.cumprod(moved, axis=0).astype(bool)
     entry: dict[str, Any] = {"together": float(together.mean())}
-    for name, ours, theirs in zip(TOLD, here, there, strict=True):
+    for name, ours, theirs in zip(QUANTITIES, here, there, strict=True):
         apart = np.abs(ours - theirs)[together]
         entry[name] = {"largest": float(apart.max()), "share": float((apart > 1e-3).mean())}
     return entry
@@ -118,15 +118,15 @@ def main() -> None:
     simulators = {name: compare_simulators(name) for name in ("maze", "cave")}
     for name, entry in simulators.items():
         print(f"{name}: {100 * entry['together']:.2f} % of the steps in the same place; largest")
-        print("  " + ", ".join(f"{key} {entry[key]['largest']:.2g}" for key in TOLD))
+        print("  " + ", ".join(f"{key} {entry[key]['largest']:.2g}" for key in QUANTITIES))
     recurrences = {}
     if gru_kernel.fits(SIZES[0][1], HIDDEN):
         for size in SIZES:
-            words = "{} seeds, {} steps, {} robots".format(*size)
-            recurrences[words] = compare_recurrences(size, options.repeats)
+            size_text = "{} seeds, {} steps, {} robots".format(*size)
+            recurrences[size_text] = compare_recurrences(size, options.repeats)
             print(
-                words,
-                *(f"{name} {value}" for name, value in recurrences[words].items()),
+                size_text,
+                *(f"{name} {value}" for name, value in recurrences[size_text].items()),
                 sep="\n  ",
             )
     else:

@@ -64,7 +64,7 @@ def parse_plan(plan: str, size: int) -> tuple[NDArray[np.bool_], list[NDArray[np
 
     Returns:
       occupied: bool [size, size], row 0 at the bottom.
-      marked, all_cells: the centres (x, y) [.., 2] in m of the plan's cells marked `*`, and of all.
+      marked, all_cells: the centers (x, y) [.., 2] in m of the plan's cells marked `*`, and of all.
     """
     lines = plan.strip("\n").splitlines()[::-1]
     count = len(lines) // 2
@@ -186,7 +186,7 @@ def draw_column() -> OccupancyMap:
     for x, y, radius in COLUMN:
         where, cells = disc(SMALL_SIZE, (x, y), radius)
         occupied[where] |= cells
-    return finish_map("column", occupied, [(1.5, 15.5), (15.5, 1.5)], spawn_count=40, room=0.6)
+    return finish_map("column", occupied, [(1.5, 15.5), (15.5, 1.5)], spawn_count=40, clearance=0.6)
 
 
 def draw_forest() -> OccupancyMap:
@@ -201,7 +201,7 @@ def draw_forest() -> OccupancyMap:
         where, cells = asterisk(SMALL_SIZE, (x, y), angles, lengths, FOREST_ARM)
         occupied[where] |= cells
     occupied = round_crooks(occupied)
-    return finish_map("forest", occupied, [(1.5, 1.5), (15.5, 15.5)], spawn_count=40, room=0.5)
+    return finish_map("forest", occupied, [(1.5, 1.5), (15.5, 15.5)], spawn_count=40, clearance=0.5)
 
 
 def draw_cave() -> OccupancyMap:
@@ -215,7 +215,7 @@ def draw_cave() -> OccupancyMap:
         carve_tunnels(CAVE_SIZE, CAVE, rng),
         [(5.0, 6.0), (46.0, 46.0)],
         spawn_count=100,
-        room=0.7,
+        clearance=0.7,
         max_steps=1200,
     )
 

@@ -61,7 +61,7 @@ def _nearest(places: NDArray[np.floating], points: NDArray[np.floating]) -> NDAr
 
 
 def main() -> None:
-    """Drive every policy and write what became of its episodes."""
+    """Run every policy and write what became of its episodes."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("policies", nargs="+", metavar="RUN|pretrained:NAME")
     parser.add_argument("--map", default="cave")
@@ -70,19 +70,19 @@ def main() -> None:
     options = parser.parse_args()
     settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
     agents = [TrainedAgent(word, (find_policy(word),)) for word in options.policies]
-    found = {}
+    by_policy = {}
 
     def keep(batch: EpisodeBatch) -> None:
         points = batch.world.occupancy_map.evaluation_points
-        found[Path(batch.agent.name).name] = failures(batch, points)
+        by_policy[Path(batch.agent.name).name] = failures(batch, points)
 
     evaluate_session(agents, settings, on_evaluated=keep, fields=("info",))
-    write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": found})
-    for name, told in found.items():
+    write_json(options.out, {"map": options.map, "last_steps": LAST_STEPS, "policies": by_policy})
+    for name, counts in by_policy.items():
         print(
-            f"{name}: success {told['success']:.2f}; of {told['failures']} failures "
-            f"{told['stand_still_pushing']} push and stand still, "
-            f"{told['stand_still_otherwise']} stand still otherwise"
+            f"{name}: success {counts['success']:.2f}; of {counts['failures']} failures "
+            f"{counts['stand_still_pushing']} push and stand still, "
+            f"{counts['stand_still_otherwise']} stand still otherwise"
         )
 
 

@@ -28,9 +28,9 @@ OUT = ROOT / "docs" / "images"
 def episodes(name: str, map_name: str, count: int) -> tuple[Episode, ...]:
     """The first episodes from the evaluation points, under the evaluation's first seed."""
     policy = find_policy(f"pretrained:{name}")
-    driven = record(policy, map_name, episodes=count)
+    recorded_episodes = record(policy, map_name, episodes=count)
     agent = policy.config.algo.upper()
-    return tuple(dataclasses.replace(episode, agent=agent) for episode in driven)
+    return tuple(dataclasses.replace(episode, agent=agent) for episode in recorded_episodes)
 
 
 def maps() -> Any:
@@ -60,14 +60,16 @@ def timeline() -> Any:
 
 def skills() -> Any:
     """Which skill decides where, on every map."""
-    driven = [episode for name in PAPER_MAPS for episode in episodes("best", name, 6)]
-    return figures.skill_trajectories(driven, title="Weights of the two skills along the way")
+    recorded_episodes = [episode for name in PAPER_MAPS for episode in episodes("best", name, 6)]
+    return figures.skill_trajectories(
+        recorded_episodes, title="Weights of the two skills along the way"
+    )
 
 
 def agents() -> Any:
     """The same tasks for every agent."""
-    driven = {name.upper(): episodes(name, "maze", 8)[:3] for name in ALGORITHMS}
-    return figures.agents_side_by_side(driven, title="The same tasks on the maze")
+    by_agent = {name.upper(): episodes(name, "maze", 8)[:3] for name in ALGORITHMS}
+    return figures.agents_side_by_side(by_agent, title="The same tasks on the maze")
 
 
 def learning_curve() -> Any:
@@ -78,16 +80,16 @@ def learning_curve() -> Any:
 
 def learning_curves() -> Any:
     """How three agents learn, from the record of the table's runs."""
-    found = recorded("pretrained_runs.json")["runs"]
-    curves = {one["config"]["algo"].upper(): [one["curve"]] for one in found}
+    runs = recorded("pretrained_runs.json")["runs"]
+    curves = {run_record["config"]["algo"].upper(): [run_record["curve"]] for run_record in runs}
     return figures.learning_curves(curves, title="Training on the maze")
 
 
 def robustness() -> Any:
     """Success under noise, from the record of the robustness runs."""
     results = recorded("pretrained_noise.json")["results"]
-    kept = [entry for entry in results if entry["goal_radius"] == results[0]["goal_radius"]]
-    return figures.robustness(kept, title="Maze, evaluation points")
+    selected = [entry for entry in results if entry["goal_radius"] == results[0]["goal_radius"]]
+    return figures.robustness(selected, title="Maze, evaluation points")
 
 
 STILLS: dict[str, Callable[[], Any]] = {

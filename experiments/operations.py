@@ -48,12 +48,12 @@ def update_operations(
     forward. And for the observations of the burn-in: both networks forward, up to the recurrent
     state.
 
-    Not counted: all that is no matrix product (activations, gates, softmax, targets, optimiser,
+    Not counted: all that is no matrix product (activations, gates, softmax, targets, optimizer,
     drawing). The number says what is asked for, however a program goes about it.
 
     Args:
         algo: the agent.
-        network: its sizes; layer normalisation changes nothing.
+        network: its sizes; layer normalization changes nothing.
         num_beams: range readings of an observation.
         goal_size: numbers that tell the goal.
         num_actions: actions.

@@ -31,13 +31,13 @@ def record(path: Path) -> dict[str, Any]:
     if not (path / "summary.json").is_file():
         raise ValueError(f"run folder {path}: not finished, expected a summary.json in it")
     rows = folder.read_metrics()
-    kept = rows[:: max(1, len(rows) // CURVE_ROWS)] + rows[-1:]
+    selected = rows[:: max(1, len(rows) // CURVE_ROWS)] + rows[-1:]
     return {
         "run": path.name,
         "summary": json.loads((path / "summary.json").read_text(encoding="utf-8")),
         "evaluation": json.loads((path / "evaluation.json").read_text(encoding="utf-8"))["results"],
         "config": to_public_dict(config),
-        "curve": [{name: row[name] for name in CURVE} for row in kept],
+        "curve": [{name: row[name] for name in CURVE} for row in selected],
     }
 
 

@@ -25,7 +25,7 @@ from sqn_jax.policies.pretrained import find_policy, write_policy
 from sqn_jax.policies.run_policies import Policy, load_policy, require_same_network
 from sqn_jax.storage.run_folder import RunFolder
 
-WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "weights"
+WEIGHTS = Path(__file__).resolve().parents[1] / "sqn_jax" / "policies" / "weights"
 
 
 def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
@@ -34,9 +34,9 @@ def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _runs_of(path: Path) -> list[dict[str, Any]]:
-    told = json.loads(path.read_text("utf-8"))
-    if "card" in told:
-        before = told["card"]
+    contents = json.loads(path.read_text("utf-8"))
+    if "card" in contents:
+        before = contents["card"]
         facts = ("training_episodes", "training_minutes", "device")
         last = {"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts}
         return [*before["went_on_from"], last]
@@ -48,7 +48,7 @@ def _runs_of(path: Path) -> list[dict[str, Any]]:
             "training_minutes": round(run["summary"]["wall_seconds"] / 60, 1),
             "device": run["summary"]["device"],
         }
-        for run in told["runs"]
+        for run in contents["runs"]
     ]
 
 

@@ -60,7 +60,7 @@ def weights_by_situation(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Drive all variants and write what they came to."""
+    """Run all variants and write what they came to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("policy", metavar="RUN|pretrained:NAME")
     parser.add_argument("--maps", nargs="+", default=["maze", "cave"])
@@ -70,22 +70,24 @@ def main() -> None:
     policies = variants(find_policy(options.policy))
     agents = [TrainedAgent(name, (policy,)) for name, policy in policies.items()]
     settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
-    found: dict[str, Any] = {}
+    by_map: dict[str, Any] = {}
 
     def keep(batch: EpisodeBatch) -> None:
-        told: dict[str, Any] = {"success": float(np.mean(batch.main_metrics.success))}
+        entry: dict[str, Any] = {"success": float(np.mean(batch.main_metrics.success))}
         if batch.agent.name == AS_IT_IS:
-            told["weights"] = weights_by_situation(batch.trajectory)
-        found.setdefault(batch.world.occupancy_map.name, {})[batch.agent.name] = told
+            entry["weights"] = weights_by_situation(batch.trajectory)
+        by_map.setdefault(batch.world.occupancy_map.name, {})[batch.agent.name] = entry
 
     evaluate_session(agents, settings, on_evaluated=keep, fields=("info", "output"))
-    write_json(options.out, {"policy": options.policy, "episodes": options.episodes, "maps": found})
-    for name, entries in found.items():
-        for variant, told in entries.items():
-            print(f"{name}, {variant}: success {told['success']:.2f}")
-        for situation, told in entries[AS_IT_IS]["weights"].items():
-            shown = ", ".join(f"{weight:.2f}" for weight in told["weights"])
-            print(f"  {situation} ({100 * told['share']:.0f} % of the steps): weights {shown}")
+    write_json(
+        options.out, {"policy": options.policy, "episodes": options.episodes, "maps": by_map}
+    )
+    for name, entries in by_map.items():
+        for variant, entry in entries.items():
+            print(f"{name}, {variant}: success {entry['success']:.2f}")
+        for situation, figures in entries[AS_IT_IS]["weights"].items():
+            shown = ", ".join(f"{weight:.2f}" for weight in figures["weights"])
+            print(f"  {situation} ({100 * figures['share']:.0f} % of the steps): weights {shown}")
 
 
 if __name__ == "__main__":

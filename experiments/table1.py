@@ -43,17 +43,17 @@ def paper_table(results: list[dict[str, Any]]) -> str:
                 for entry in results
                 if (entry["agent"], entry["map"], entry["goal_radius"]) == (agent, name, radius)
             )
-            told = f"{_spread(entry['success'], 2)}, {_spread(entry['time_steps'], 1)}"
+            cell = f"{_spread(entry['success'], 2)}, {_spread(entry['time_steps'], 1)}"
             if name in PAPER_RESULTS.get(entry["algorithm"], {}):
                 success, steps = PAPER_RESULTS[entry["algorithm"]][name]
-                told += f" (paper {success:.2f}, {steps:.1f})"
-            row.append(told)
+                cell += f" (paper {success:.2f}, {steps:.1f})"
+            row.append(cell)
         rows.append(row)
     return markdown_table(["agent: success, time steps", *maps], rows)
 
 
-def _spread(told: dict[str, Any], digits: int) -> str:
-    mean, spread = told["mean"], told["std_of_means"]
+def _spread(statistics: dict[str, Any], digits: int) -> str:
+    mean, spread = statistics["mean"], statistics["std_of_means"]
     return f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
 
 
@@ -73,12 +73,13 @@ def report(evaluation: dict[str, Any], settings: Settings) -> str:
         "",
         results_table(results),
     ]
-    for told in evaluation["comparisons"]:
-        low, high = told["ci95"]
+    for comparison in evaluation["comparisons"]:
+        low, high = comparison["ci95"]
         lines += [
             "",
-            f"A training run of {told['first']} has more success than one of {told['second']} with "
-            f"probability {told['probability']:.2f} [{low:.2f}, {high:.2f}].",
+            f"A training run of {comparison['first']} has more success than one of "
+            f"{comparison['second']} with "
+            f"probability {comparison['probability']:.2f} [{low:.2f}, {high:.2f}].",
         ]
     return "\n".join(lines) + "\n"
 

@@ -1,6 +1,6 @@
 """The Skill Q-Network and one R2D2 update in PyTorch, to compare the learner with.
 
-The same network, loss and optimiser as `sqn_jax.agent` (preset `paper`), written the way one would
+The same network, loss and optimizer as `sqn_jax.agent` (preset `paper`), written the way one would
 in PyTorch and with what it has for speed: `nn.GRU` over the whole sequence, fused Adam, no graph
 for burn-in and target. Tensors are time-major, as there: T steps, B episodes, R beams, G goal
 numbers, A actions, K skills, H hidden units. Needs `pip install torch`.
@@ -79,7 +79,7 @@ class SkillQNetwork(nn.Module):
     """GRU perception, skill decision and K latent skills (paper eq. 1 to 6).
 
     Raises:
-        ValueError: the config asks for layer normalisation.
+        ValueError: the config asks for layer normalization.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ def r2d2_loss(
 
 
 class Learner:
-    """Online and target network and the optimiser.
+    """Online and target network and the optimizer.
 
     Raises:
         ValueError: a setting of the learner that is a switch is not the preset `paper`'s.
@@ -241,7 +241,7 @@ class Learner:
         )
 
     def update(self, batch: Batch) -> Tensor:
-        """One step of the optimiser and one of the target network; returns priorities [B]."""
+        """One step of the optimizer and one of the target network; returns priorities [B]."""
         loss, td_errors = r2d2_loss(self.online, self.target, batch, self.config)
         self.optimizer.zero_grad()
         loss.backward()

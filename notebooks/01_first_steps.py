@@ -46,7 +46,7 @@ SEED = 1_000  # of starts and goals; the policy was trained with other ones
 # %% [markdown]
 # ## A map
 #
-# An occupancy grid: row 0 at the bottom, positions in metres from the lower left corner. Four come
+# An occupancy grid: row 0 at the bottom, positions in meters from the lower left corner. Four come
 # with the package; agents are trained on the maze, the others are for looking at what they make of
 # a map they never saw. The numbers are the evaluation points.
 
@@ -66,12 +66,12 @@ for there in maps:
     free = traversable(there.occupied, there.resolution, 0.1)
     points = there.evaluation_points
     row, column = points_to_cells(points, there.resolution).T
-    ways = goal_distance(free, there.resolution, points)[:, row, column]
+    path_lengths = goal_distance(free, there.resolution, points)[:, row, column]
     lines = np.linalg.norm(points[:, None] - points[None], axis=-1)
     apart = ~np.eye(len(points), dtype=bool)
-    ratio = ways[apart] / lines[apart]
+    ratio = path_lengths[apart] / lines[apart]
     rows.append([there.name, f"{there.size_m[0]:g} x {there.size_m[1]:g}", f"{there.max_steps}"])
-    rows[-1] += [f"{ways[apart].mean():.1f}", f"{ratio.mean():.2f}", f"{ratio.max():.2f}"]
+    rows[-1] += [f"{path_lengths[apart].mean():.1f}", f"{ratio.mean():.2f}", f"{ratio.max():.2f}"]
 header = ["map", "size, m", "steps an episode", "mean way, m", "way / line, mean", "largest"]
 print(markdown_table(header, rows))
 
@@ -126,9 +126,9 @@ LENGTH = 10 if SMALL else 100
 
 
 @partial(jax.jit, static_argnames="robots")
-def drive_randomly(key, params, *, robots):
-    """Drive robots at random for LENGTH steps; returns their mean reward a step."""
-    start_key, drive_key = jax.random.split(key)
+def act_randomly(key, params, *, robots):
+    """Move robots at random for LENGTH steps; returns their mean reward a step."""
+    start_key, rollout_key = jax.random.split(key)
     _, states = jax.vmap(sqn_jax.reset, in_axes=(0, None))(
         jax.random.split(start_key, robots), params
     )
@@ -141,18 +141,16 @@ def drive_randomly(key, params, *, robots):
         )
         return states, rewards.mean()
 
-    return jnp.mean(jax.lax.scan(advance, states, jax.random.split(drive_key, LENGTH))[1])
+    return jnp.mean(jax.lax.scan(advance, states, jax.random.split(rollout_key, LENGTH))[1])
 
 
 begun = time.perf_counter()
-jax.block_until_ready(drive_randomly(jax.random.key(0), params, robots=ROBOTS))
+jax.block_until_ready(act_randomly(jax.random.key(0), params, robots=ROBOTS))
 print(f"first call, with compilation: {time.perf_counter() - begun:.1f} s")
 speeds = []
 for repeat in range(1, 6):
     begun = time.perf_counter()
-    mean_reward = jax.block_until_ready(
-        drive_randomly(jax.random.key(repeat), params, robots=ROBOTS)
-    )
+    mean_reward = jax.block_until_ready(act_randomly(jax.random.key(repeat), params, robots=ROBOTS))
     speeds.append(ROBOTS * LENGTH / (time.perf_counter() - begun))
 print(f"{ROBOTS} robots, {LENGTH} steps, 5 times: median {np.median(speeds):,.0f} steps a second")
 print(f"slowest {min(speeds):,.0f}, fastest {max(speeds):,.0f}, on {jax.devices()[0].platform}")

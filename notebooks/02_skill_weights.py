@@ -55,12 +55,12 @@ SEED = 1_000  # of starts and goals; the policy was trained with other ones
 
 # %%
 policy = find_policy("pretrained:best")
-driven = {
+recorded = {
     name: record(policy, name, episodes=EPISODES, seed=SEED, max_steps=STEPS) for name in MAPS
 }
-episodes = driven["maze"]
+episodes = recorded["maze"]
 print(f"trained on {policy.config.map}")
-for name, those in driven.items():
+for name, those in recorded.items():
     print(f"{name}: {sum(e.success for e in those)} of {len(those)} reached the goal")
 
 # %% [markdown]
@@ -69,11 +69,11 @@ for name, those in driven.items():
 # The success that took longest among the first twenty on the last of the maps.
 
 # %%
-longest = max(driven[MAPS[-1]][:20], key=lambda e: (e.success, e.time_steps))
+longest = max(recorded[MAPS[-1]][:20], key=lambda e: (e.success, e.time_steps))
 figures.picture(figures.episode_timeline(longest, title="The longest way to a goal"))
 
 # %%
-shown = [episode for those in driven.values() for episode in those[:6]]
+shown = [episode for those in recorded.values() for episode in those[:6]]
 figures.picture(figures.skill_trajectories(shown, title="Where which skill has the weight"))
 
 # %% [markdown]
@@ -89,7 +89,7 @@ figures.picture(figures.skill_trajectories(shown, title="Where which skill has t
 # - over the next 2 s, with changes of less than 0.5 m not counted: **into a dead end**, the
 #   straight line to the goal shrinks while the way over the map grows; **on a detour**, the line
 #   grows while the way shrinks; **directly**, both shrink,
-# - the **way left** over the map, in metres.
+# - the **way left** over the map, in meters.
 #
 # The mean over an episode's steps is one value; the interval is a 95 % bootstrap over episodes.
 
@@ -97,17 +97,17 @@ figures.picture(figures.skill_trajectories(shown, title="Where which skill has t
 AHEAD = 20  # steps, 2 s
 
 
-def ways_left(episodes):
+def distances_left(episodes):
     """For each episode [T + 1] m, the shortest way left before each step and after the last."""
     there = episodes[0].occupancy_map
     free = traversable(there.occupied, there.resolution, episodes[0].robot_radius)
     goals = np.array([episode.goal for episode in episodes])
-    ways = {}
+    distances = {}
     for same, field in goal_fields(free, there.resolution, goals):
         for index in same:
             row, column = points_to_cells(episodes[index].poses[:, :2], there.resolution).T
-            ways[index] = field[row, column]
-    return [ways[index] for index in range(len(episodes))]
+            distances[index] = field[row, column]
+    return [distances[index] for index in range(len(episodes))]
 
 
 def situations_of(episode, way):
@@ -156,15 +156,15 @@ def with_interval(values):
 
 # %%
 places_of = {
-    name: [situations_of(e, w) for e, w in zip(those, ways_left(those), strict=True)]
-    for name, those in driven.items()
+    name: [situations_of(e, w) for e, w in zip(those, distances_left(those), strict=True)]
+    for name, those in recorded.items()
 }
 for map_name, places in places_of.items():
     total = sum(len(each["all steps"]) for each in places)
     rows = []
     for name in places[0]:
         second, entropy = [], []
-        for episode, place in zip(driven[map_name], places, strict=True):
+        for episode, place in zip(recorded[map_name], places, strict=True):
             weights = episode.skill_weights[1 : episode.time_steps][place[name]]
             if len(weights):
                 second.append(weights[:, 1].mean())
@@ -193,7 +193,7 @@ for map_name, places in places_of.items():
     rows = []
     for one, other in pairs:
         differences = []
-        for episode, place in zip(driven[map_name], places, strict=True):
+        for episode, place in zip(recorded[map_name], places, strict=True):
             second = episode.skill_weights[1 : episode.time_steps, 1]
             if place[one].any() and place[other].any():
                 differences.append(second[place[one]].mean() - second[place[other]].mean())
@@ -214,7 +214,7 @@ for map_name, places in places_of.items():
 # the value of the ensemble's best action. Steps of all maps together.
 
 # %%
-everywhere = [episode for those in driven.values() for episode in those]
+everywhere = [episode for those in recorded.values() for episode in those]
 weights = np.concatenate([e.skill_weights[: e.time_steps] for e in everywhere])
 values = np.concatenate([e.skill_q_values[: e.time_steps] for e in everywhere])
 actions = np.concatenate([e.actions[: e.time_steps] for e in everywhere])
@@ -318,9 +318,9 @@ figures.picture(
 
 # %%
 rows = []
-for name, driven in columns.items():
-    chosen = np.concatenate([e.actions[: e.time_steps] for e in driven])
-    moves = np.concatenate([np.diff(e.poses[: e.time_steps + 1, :2], axis=0) for e in driven])
+for name, those in columns.items():
+    chosen = np.concatenate([e.actions[: e.time_steps] for e in those])
+    moves = np.concatenate([np.diff(e.poses[: e.time_steps + 1, :2], axis=0) for e in those])
     in_place = np.mean(np.linalg.norm(moves, axis=1) < 1e-6)
     shares = [f"{np.mean(chosen == action):.3f}" for action in range(len(ACTION_NAMES))]
     rows.append([name, *shares, f"{in_place:.3f}"])

@@ -11,7 +11,7 @@
 # %% [markdown]
 # # Your own map, from the file to the success rate
 #
-# SLAM writes a map as a grey image and a YAML file. This notebook makes such a pair, with all that
+# SLAM writes a map as a gray image and a YAML file. This notebook makes such a pair, with all that
 # real ones have (unknown ground, a turned origin, specks), and drives a policy on it that was
 # trained on the maze alone. You will learn
 #
@@ -46,7 +46,7 @@ SEED = 1_000  # of starts and goals
 # ## The files
 #
 # An office of 16 x 12 m at 0.05 m a cell: rooms along a corridor, doors of 1 m, some furniture.
-# White (254) is free, black (0) occupied, grey (205) was never seen. The scanner left specks on the
+# White (254) is free, black (0) occupied, gray (205) was never seen. The scanner left specks on the
 # floor and frayed walls, and the map frame is turned against the image, as it is when the robot did
 # not start along a wall.
 
@@ -73,10 +73,10 @@ def draw_office(*, dirt=True, furniture=True):
     rows, columns = round(12 / RESOLUTION), round(16 / RESOLUTION)
     building = np.full((rows, columns), FREE, np.uint8)
 
-    def fill(x, y, width, height, grey, inset=0.0):
+    def fill(x, y, width, height, gray, inset=0.0):
         left, right = round((x + inset) / RESOLUTION), round((x + width - inset) / RESOLUTION)
         bottom, top = round((y + inset) / RESOLUTION), round((y + height - inset) / RESOLUTION)
-        building[rows - top : rows - bottom, left:right] = grey
+        building[rows - top : rows - bottom, left:right] = gray
 
     for box in (*WALLS, *(FURNITURE if furniture else [])):
         fill(*box, OCCUPIED)
@@ -104,8 +104,8 @@ folder = tempfile.TemporaryDirectory()
 image = draw_office()
 path, text = write_map(folder.name, "office", image)
 print(text)
-for name, grey in (("free", FREE), ("occupied", OCCUPIED), ("unknown", UNKNOWN)):
-    print(f"{name}: {np.mean(image == grey):.1%} of the cells")
+for name, gray in (("free", FREE), ("occupied", OCCUPIED), ("unknown", UNKNOWN)):
+    print(f"{name}: {np.mean(image == gray):.1%} of the cells")
 
 # %% [markdown]
 # Four more keys are our own, and ROS passes over them: `max_steps`, `spawn_points`, `spawn_radius`
@@ -154,10 +154,10 @@ def keep(batch):
     batches[batch.agent.name, batch.world.occupancy_map.name] = batch
 
 
-def interval(told, digits):
+def interval(statistics, digits):
     """Mean and 95 % interval of an entry of the evaluation."""
-    low, high = told["ci95"]
-    return f"{told['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    low, high = statistics["ci95"]
+    return f"{statistics['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def measure(agents, *maps):

@@ -114,14 +114,14 @@ PAPER = {
 
 def level_name(noise):
     """A word for a pair of noises."""
-    words = [f"velocity {noise[0]:g}"] * (noise[0] > 0) + [f"range {noise[1]:.0%}"] * (noise[1] > 0)
-    return words[0] if words else "none"
+    parts = [f"velocity {noise[0]:g}"] * (noise[0] > 0) + [f"range {noise[1]:.0%}"] * (noise[1] > 0)
+    return parts[0] if parts else "none"
 
 
-def interval(told, digits):
+def interval(statistics, digits):
     """Mean and 95 % interval of an entry of the evaluation."""
-    low, high = told["ci95"]
-    return f"{told['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    low, high = statistics["ci95"]
+    return f"{statistics['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 rows = []
@@ -216,8 +216,8 @@ for noise in (QUIET, VELOCITY[-1], RANGES[-1]):
         f"{point_number(batch.starts[e, :2])} to {point_number(batch.goals[e])}" for e in lost
     )
     nearest = batch.trajectory.info["goal_distance"][:, lost].min(axis=0)
-    told = ", ".join(f"{pair}: {count}" for pair, count in pairs.most_common(5)) or "none"
-    print(f"{level_name(noise)}: {len(lost)} of {EPISODES} failed; {told}", end="")
+    most_common = ", ".join(f"{pair}: {count}" for pair, count in pairs.most_common(5)) or "none"
+    print(f"{level_name(noise)}: {len(lost)} of {EPISODES} failed; {most_common}", end="")
     print(f"; nearest to the goal, median {np.median(nearest):.1f} m" if len(lost) else "")
 
 # %% [markdown]

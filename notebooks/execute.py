@@ -95,15 +95,15 @@ def execute(notebook: Any) -> None:
                 manager.shutdown_kernel(now=True)
 
 
-def keep_outputs(notebook: Any, kept: Any) -> None:
+def keep_outputs(notebook: Any, before: Any) -> None:
     """Put the outputs of an earlier run into a notebook whose code is the same."""
     code, earlier = (
-        [cell for cell in each.cells if cell.cell_type == "code"] for each in (notebook, kept)
+        [cell for cell in each.cells if cell.cell_type == "code"] for each in (notebook, before)
     )
     if [cell.source for cell in code] != [cell.source for cell in earlier]:
         sys.exit("code has changed since the last run, expected a change of words alone")
-    for cell, before in zip(code, earlier, strict=True):
-        cell.outputs, cell.execution_count = before.outputs, before.execution_count
+    for cell, past in zip(code, earlier, strict=True):
+        cell.outputs, cell.execution_count = past.outputs, past.execution_count
 
 
 if __name__ == "__main__":

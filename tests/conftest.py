@@ -6,9 +6,11 @@ it has compiled between two files, and one that crashes ends the run.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import resource
+import sys
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -107,6 +109,8 @@ def give_back_programs() -> Iterator[None]:
     if mappings > MAX_MAPPINGS:
         jax.clear_caches()
         gc.collect()
+        if sys.platform == "linux":  # What is freed stays with the process unless asked for.
+            getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

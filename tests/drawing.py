@@ -31,12 +31,12 @@ def panels(figure: Any) -> list[Any]:
 
 def marks(axes: Any, marker: str) -> NDArray[np.float64]:
     """Places [M, 2] of the marks of one kind."""
-    found = [line.get_xydata() for line in axes.lines if line.get_marker() == marker]
-    return np.concatenate(found) if found else np.zeros((0, 2))
+    places = [line.get_xydata() for line in axes.lines if line.get_marker() == marker]
+    return np.concatenate(places) if places else np.zeros((0, 2))
 
 
-def ways(axes: Any) -> list[Any]:
-    """The drives drawn in a panel, each in pieces that have colours of their own."""
+def drawn_paths(axes: Any) -> list[Any]:
+    """The paths drawn in a panel, each in pieces that have colors of their own."""
     return [child for child in axes.collections if isinstance(child, LineCollection)]
 
 

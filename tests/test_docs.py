@@ -38,7 +38,10 @@ PAGES = sorted(
     [
         *(README, ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")),
         *(ROOT / "experiments" / "README.md", RECORDS / "README.md"),
-        *(ROOT / "notebooks" / "README.md", ROOT / "sqn_jax" / "weights" / "README.md"),
+        *(
+            ROOT / "notebooks" / "README.md",
+            ROOT / "sqn_jax" / "policies" / "weights" / "README.md",
+        ),
     ]
 )
 MOST_WORDS = 900
@@ -49,10 +52,11 @@ SMALLER = {
     # For each command what replaces an option with its values, or is put in.
     "train": {"--preset": TRAIN, "--total-episodes": ["--total-episodes", "128"]}
     | {"--num-seeds": ["--num-seeds", "2"], "--map": ["--map", "maze*2,maze:0"]},
-    "evaluate": {"--episodes": EVALUATE, "--eval-seeds": [], "--max-steps": ["--max-steps", "20"]},
-    "report": {"--episodes": EVALUATE, "--eval-seeds": [], "--maps": ["--maps", "maze"]},
+    "evaluate": {"--episodes": EVALUATE, "--eval-seeds": [], "--max-steps": ["--max-steps", "20"]}
+    | {"--maps": ["--maps", "my_map.yaml"]},
+    "report": {"--episodes": EVALUATE, "--eval-seeds": [], "--maps": ["--maps", "my_map.yaml"]},
     "render": {"--episodes": ["--episodes", "1"], "--max-steps": ["--max-steps", "20"]}
-    | {"--animations": ["--animations", "1"]},
+    | {"--animations": ["--animations", "1"], "--map": ["--map", "maze"]},
     "map": {},
 }
 
@@ -281,7 +285,7 @@ def smaller(words: list[str]) -> list[str]:
         while rest and not rest[0].startswith("-"):
             rest.pop(0)
         kept += table.pop(option)
-    put_in = ("--preset", "--episodes", "--max-steps")
+    put_in = ("--preset", "--episodes", "--max-steps", "--maps")
     return [command, *kept, *(word for name in put_in for word in table.get(name, []))]
 
 

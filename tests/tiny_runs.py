@@ -51,21 +51,21 @@ class TinyRuns:
             "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         }
 
-    def words(self, run: str, *more: str, resume: bool = False) -> list[str]:
+    def arguments(self, run: str, *more: str, resume: bool = False) -> list[str]:
         """The command line of a new run or of one to go on with."""
-        told = ["--run-dir", str(self.folder / run)]
+        arguments = ["--run-dir", str(self.folder / run)]
         if resume:
-            told += ["--resume", "--num-devices", "1"]
+            arguments += ["--resume", "--num-devices", "1"]
         else:
             for name, value in self.options.items():
-                told += [f"--{name}", value] if value else [f"--{name}"]
-        told += more
-        return ["train", *told]
+                arguments += [f"--{name}", value] if value else [f"--{name}"]
+        arguments += more
+        return ["train", *arguments]
 
     def start(self, run: str, *more: str, resume: bool = False) -> subprocess.Popen[str]:
         """Start a process, which keeps its compiled programs for the others."""
         return subprocess.Popen(
-            [sys.executable, "-m", "sqn_jax", *self.words(run, *more, resume=resume)],
+            [sys.executable, "-m", "sqn_jax", *self.arguments(run, *more, resume=resume)],
             env=self.environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -83,7 +83,7 @@ class TinyRuns:
             compiling_quickly(),
         ):
             warnings.simplefilter("always")
-            code = main(self.words(run, *more, resume=resume))
+            code = main(self.arguments(run, *more, resume=resume))
         return code, out.getvalue(), err.getvalue()
 
     def finish(self, run: str, *more: str, resume: bool = False) -> str:
@@ -118,15 +118,15 @@ class TinyRuns:
         assert self.rows(run) == self.rows(other)
         assert [row["chunk"] for row in self.rows(run)] == list(range(1, self.chunks + 1))
         for name in ("evaluation.json", "evaluation.jsonl"):
-            told = [(self.folder / each / name).read_text() for each in (run, other)]
-            assert told[0].replace(run, "RUN") == told[1].replace(other, "RUN")
+            texts = [(self.folder / label / name).read_text() for label in (run, other)]
+            assert texts[0].replace(run, "RUN") == texts[1].replace(other, "RUN")
 
 
 def wait_for(condition: Callable[[], Any], seconds: float = 120) -> Any:
     """Ask until it holds; what it returned."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        if found := condition():
-            return found
+        if result := condition():
+            return result
         time.sleep(0.005)
     raise AssertionError("waited in vain")

@@ -7,10 +7,10 @@ Same equations as `flax.linen.GRUCell` (Cho et al. 2014, reset gate after the pr
 
 Only U h depends on the step before. The input half is one matrix product over all steps, and the
 backward pass leaves just the three small products of a step in its loop: the gradients of both
-halves' matrices are gathered afterwards in a single large product each, from arrays with the three
+halves' matrices are gathered afterward in a single large product each, from arrays with the three
 gates side by side. Automatic differentiation would add up a [128, 384] matrix 400 times instead.
 
-On an NVIDIA GPU that has the room the loops are two kernels (`gru_kernel`).
+On an NVIDIA GPU with enough memory the loops are two kernels (`gru_kernel`).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _orthogonal_gates(key: Array, shape: tuple[int, int]) -> Array:
 def _orthogonal(key: Array, size: int) -> Array:
     """A random orthogonal matrix [size, size]: the columns of a normal one, made orthonormal.
 
-    Gram and Schmidt, each column twice, not the library's QR: jaxlib's batched factorisation waits
+    Gram and Schmidt, each column twice, not the library's QR: jaxlib's batched factorization waits
     in a thread of the CPU's pool for other threads of that pool, and several seeds at once on two
     cores then wait for each other for ever.
     """
@@ -98,12 +98,14 @@ def scan_gru(projected: Array, carry: Array, hidden_kernel: Array, candidate_bia
 def _forward(
     projected: Array, carry: Array, hidden_kernel: Array, candidate_bias: Array
 ) -> tuple[Array, tuple[Array, ...]]:
-    given = (projected, carry, split_gates(hidden_kernel), candidate_bias)
+    arguments = (projected, carry, split_gates(hidden_kernel), candidate_bias)
     if gru_kernel.fits(len(projected), carry.shape[-1]):
-        told = jax.lax.platform_dependent(*given, cuda=gru_kernel.forward, default=_scan_forward)
+        outputs = jax.lax.platform_dependent(
+            *arguments, cuda=gru_kernel.forward, default=_scan_forward
+        )
     else:
-        told = _scan_forward(*given)
-    hidden, *gates = told
+        outputs = _scan_forward(*arguments)
+    hidden, *gates = outputs
     return hidden, (hidden, carry, hidden_kernel, *gates)
 
 
@@ -127,8 +129,8 @@ def _scan_forward(
         new_hidden = (1 - update) * candidate + update * hidden
         return new_hidden, (new_hidden, reset, update, candidate, recurrent)
 
-    told: tuple[Array, ...] = jax.lax.scan(advance, carry, jnp.arange(len(projected)))[1]
-    return told
+    outputs: tuple[Array, ...] = jax.lax.scan(advance, carry, jnp.arange(len(projected)))[1]
+    return outputs
 
 
 def _places(hidden: Array) -> tuple[int, int, int]:
@@ -142,12 +144,14 @@ def _backward(
 ) -> tuple[Array, Array, Array, Array]:
     hidden, carry, hidden_kernel, *gates = saved
     previous = jnp.concatenate([carry[None], hidden[:-1]])
-    given = (hidden_gradient, previous, tuple(gates), split_gates(hidden_kernel))
+    arguments = (hidden_gradient, previous, tuple(gates), split_gates(hidden_kernel))
     if gru_kernel.fits(len(hidden), carry.shape[-1]):
-        told = jax.lax.platform_dependent(*given, cuda=gru_kernel.backward, default=_scan_backward)
+        outputs = jax.lax.platform_dependent(
+            *arguments, cuda=gru_kernel.backward, default=_scan_backward
+        )
     else:
-        told = _scan_backward(*given)
-    carry_gradient, to_projected, to_recurrent = told
+        outputs = _scan_backward(*arguments)
+    carry_gradient, to_projected, to_recurrent = outputs
     size = carry.shape[-1]
     rows = to_recurrent.reshape(-1, 3 * size)
     kernel_gradient = previous.reshape(-1, size).T @ rows
@@ -163,10 +167,10 @@ def _scan_backward(
     rows = jnp.zeros((num_steps, shape[0], 3 * shape[1]), previous.dtype)
 
     def retreat(
-        held: tuple[Array, Array, Array], given: tuple[Array, ...]
+        carried: tuple[Array, Array, Array], inputs: tuple[Array, ...]
     ) -> tuple[tuple[Array, Array, Array], None]:
-        later, to_projected, to_recurrent = held
-        step, gradient, before, reset, update, candidate, recurrent = given
+        later, to_projected, to_recurrent = carried
+        step, gradient, before, reset, update, candidate, recurrent = inputs
         total = gradient + later
         to_candidate = total * (1 - update) * (1 - candidate * candidate)
         to_update = total * (before - candidate) * update * (1 - update)
@@ -181,13 +185,13 @@ def _scan_backward(
             to_recurrent = jax.lax.dynamic_update_slice(to_recurrent, from_hidden[None], start)
         return (total * update + to_before, to_projected, to_recurrent), None
 
-    told: tuple[Array, Array, Array] = jax.lax.scan(
+    outputs: tuple[Array, Array, Array] = jax.lax.scan(
         retreat,
         (jnp.zeros_like(hidden_gradient[0]), rows, rows),
         (jnp.arange(num_steps), hidden_gradient, previous, *gates),
         reverse=True,
     )[0]
-    return told
+    return outputs
 
 
 scan_gru.defvjp(_forward, _backward)

@@ -60,7 +60,7 @@ def _compute_capability() -> str | None:
 def forward(
     projected: Array, carry: Array, kernels: Gates, bias: Array, *, interpret: bool = False
 ) -> tuple[Array, ...]:
-    """Hidden states and what the way back needs.
+    """Hidden states and what the backward pass needs.
 
     Args:
         projected: the input half of gates r, z, n side by side, [T, B, 3 H].
@@ -85,8 +85,8 @@ def forward(
         interpret=interpret,
         name="gru_forward",
     )
-    told = call(*filled, _fill(carry, axis=0), *kernels, bias)
-    return tuple(x[:, :batch] for x in told)
+    outputs = call(*filled, _fill(carry, axis=0), *kernels, bias)
+    return tuple(x[:, :batch] for x in outputs)
 
 
 def backward(
@@ -120,8 +120,8 @@ def backward(
         interpret=interpret,
         name="gru_backward",
     )
-    to_carry, *told = call(*filled, *(x.T for x in kernels))
-    to_reset, to_update, to_candidate, to_recurrent = (x[:, :batch] for x in told)
+    to_carry, *outputs = call(*filled, *(x.T for x in kernels))
+    to_reset, to_update, to_candidate, to_recurrent = (x[:, :batch] for x in outputs)
     halves = ((to_reset, to_update, to_candidate), (to_reset, to_update, to_recurrent))
     to_projected, to_hidden = (jnp.concatenate(half, axis=-1) for half in halves)
     return to_carry[:batch], to_projected, to_hidden
@@ -163,8 +163,8 @@ def _forward_body(
     offset = bias[...][None]
     inputs = (to_reset, to_update, to_candidate)
 
-    def advance(step: Array, held: tuple[Array, Any]) -> tuple[Array, Any]:
-        hidden, projected = held
+    def advance(step: Array, loop_state: tuple[Array, Any]) -> tuple[Array, Any]:
+        hidden, projected = loop_state
         # Asked for a step ahead: memory answers after as long as a step takes.
         upcoming = _read(inputs, jnp.minimum(step + 1, num_steps - 1))
         rounded = hidden.astype(jnp.float16)
@@ -204,8 +204,8 @@ def _backward_body(
         recurrent_half,
     )
 
-    def retreat(index: Array, held: tuple[Array, Any]) -> tuple[Array, Any]:
-        later, (gradient, before, reset, update, candidate, recurrent) = held
+    def retreat(index: Array, loop_state: tuple[Array, Any]) -> tuple[Array, Any]:
+        later, (gradient, before, reset, update, candidate, recurrent) = loop_state
         step = num_steps - 1 - index
         upcoming = _read(inputs, jnp.maximum(step - 1, 0))
         total = gradient + later

@@ -28,7 +28,7 @@ class LearnerState:
     params: Params
     """Online parameters."""
     target_params: Params
-    """Slowly following copy: r2d2 learns towards it, pqn only hands it out. None without one."""
+    """Slowly following copy: r2d2 learns toward it, pqn only evaluates it. None without one."""
     opt_state: Any
     """Adam's moments and counter."""
     memory: Any
@@ -128,14 +128,14 @@ def gradient_step(
     return new_state, output, metrics | {"gradient_norm": norm}
 
 
-def average_params(state: LearnerState, share: float) -> LearnerState:
-    """Let the copy follow as the average over about the last `share` of all updates.
+def average_params(state: LearnerState, fraction: float) -> LearnerState:
+    """Let the copy follow as the average over about the last `fraction` of all updates.
 
-    Polynomial-decay averaging: update t moves it by 1 / (1 + share t), so that the average covers
-    the same share however long the run is. The latest parameters of fresh-data Q-learning swing
+    Polynomial-decay averaging: update t moves it by 1 / (1 + fraction t), so the average covers
+    the same fraction however long the run is. The latest parameters of fresh-data Q-learning swing
     from update to update; their average is the better greedy policy by far.
     """
-    step = 1.0 / (1.0 + share * (state.num_updates - 1))
+    step = 1.0 / (1.0 + fraction * (state.num_updates - 1))
     average = jax.tree.map(lambda a, x: a + step * (x - a), state.target_params, state.params)
     return dataclasses.replace(state, target_params=average)
 

@@ -126,9 +126,9 @@ def _squared_error(
 ) -> tuple[Array, LossOutput]:
     """Compare the values of the actions taken [T', B] with their targets [T', B].
 
-    With advantage learning (Bellemare et al. 2016) each action's target is lowered by a share alpha
-    of what the action is worth less than the best one: the gap between them grows by 1 / (1 -
-    alpha), and the best action stays the best.
+    With advantage learning (Bellemare et al. 2016) an action's target is lowered by a
+    fraction alpha of what the action is worth less than the best one: the gap between them grows
+    by 1 / (1 - alpha), and the best action stays the best.
     """
     predictions = _pick(online.q_values[:-1], actions)
     if config.advantage_learning > 0:

@@ -4,9 +4,9 @@ It knows what an agent knows, the range readings and the goal's distance and hea
 observation, and remembers what it has commanded. In the manner of the tangent bug it does one of
 three things:
 
-- go: drive at the goal, or at the nearer end of the obstacle in the way, as long as that brings
+- go: head for the goal, or at the nearer end of the obstacle in the way, as long as that brings
   it closer;
-- follow: when every way on leads away from the goal, keep the obstacle at one hand;
+- follow: when every direction leads away from the goal, keep the obstacle at one hand;
 - cross: when a place in sight is nearer to the goal than any seen so far, leave the wall for it.
 
 A crossing needs a place nearer by `PROGRESS` than all before. A robot that comes to the same pose
@@ -28,14 +28,14 @@ from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 
 FINENESS = 3
 """Directions looked at for each turn of one step."""
-SIDE_ROOM = 0.06
-"""m kept from obstacles at each side."""
-WALL_ROOM = 0.2
+SIDE_CLEARANCE = 0.06
+"""Clearance from obstacles, m, at each side."""
+WALL_CLEARANCE = 0.2
 """The same while following a wall: narrower notches are passed by, the robot could not turn."""
 STEADY = 0.75
 """Turns that a heading may be off before it is corrected; half a turn cannot be helped."""
-FRONT_ROOM = 0.05
-"""m kept beyond the end of a move."""
+FRONT_CLEARANCE = 0.05
+"""m of free space beyond the end of a move."""
 GRAZING = 0.35
 """A point farther aside than this, cosine, is passed and not met, however near it is."""
 HUG = 0.45
@@ -47,11 +47,11 @@ EDGE = 0.7
 PROGRESS = 0.3
 """m by which a place must be nearer to the goal than all before to leave a wall for it."""
 CLOSE_UP = 1.0
-"""m; with no end of the obstacle in reach, the robot drives up to it while that brings as much."""
+"""m; with no end of the obstacle in reach, the robot moves up to it while that brings as much."""
 WALL_WINDOW = math.radians(50)
 """How far the nearest point of a followed wall may move round the robot in a step."""
 CROSSING_STEPS = 40
-"""Drives after which a place that was headed for is given up."""
+"""Moves after which a place that was headed for is given up."""
 SAME_PLACE = 0.1
 BREAK_OUT = 2.5
 """m; how places are rounded to notice a circle, and how far the robot then goes into the open."""
@@ -69,7 +69,7 @@ class BugNavigator:
         self.beams = beam_angles(config)
         turn = config.turn_rate * config.time_step
         if turn <= 0 or config.forward_speed * config.time_step <= 0:
-            raise ValueError("the robot cannot drive or turn, expected speeds above 0")
+            raise ValueError("the robot cannot move or turn, expected speeds above 0")
         count = max(4, round(2 * math.pi / turn)) * FINENESS
         self.directions = 2 * math.pi / count * np.arange(count)
         apart = self.beams[None] - self.directions[:, None]
@@ -92,14 +92,14 @@ class BugNavigator:
         seen = zip(self.robots, readings, clear, distance, heading, strict=True)
         return np.array([robot.choose(*what) for robot, *what in seen])
 
-    def clear_lengths(self, readings: Floats, side_room: float = SIDE_ROOM) -> Floats:
-        """How far [E, D] m robots could drive in each direction by readings [E, R] m.
+    def clear_lengths(self, readings: Floats, side_clearance: float = SIDE_CLEARANCE) -> Floats:
+        """How far [E, D] m robots could move in each direction by readings [E, R] m.
 
         Args:
             readings: what the beams show, m.
-            side_room: m to keep from obstacles at each side.
+            side_clearance: m to keep from obstacles at each side.
         """
-        width = self.config.robot_radius + side_room
+        width = self.config.robot_radius + side_clearance
         away = readings.astype(np.float32)[:, None]
         ahead, aside = away * self._ahead, away * self._aside
         hit = (
@@ -122,7 +122,7 @@ class _Robot:
         self.turn = config.turn_rate * config.time_step
         self.stride = config.forward_speed * config.time_step
         self.reverse = config.backward_speed * config.time_step
-        self.needed = self.stride + FRONT_ROOM
+        self.needed = self.stride + FRONT_CLEARANCE
         # Dead reckoning from commands; complex numbers are places, in the frame of the start.
         self.heading, self.place = 0.0, 0j
         self.goal: complex | None = None
@@ -131,34 +131,34 @@ class _Robot:
         self.wall = 0.0  # where the nearest point of the wall is seen
         self.nearest = math.inf  # least distance to the goal of any place reached or in sight
         self.crossing_to, self.crossing_left = 0j, 0
-        self.driven = math.pi  # heading of the last drive
+        self.last_heading = math.pi  # heading of the last move
         self.visited: set[tuple[int, ...]] = set()  # poses while following, rounded
-        self.turns_left, self.then_drive = 0, False
+        self.turns_left, self.then_forward = 0, False
 
     def choose(self, readings: Floats, clear: Floats, distance: float, heading: float) -> int:
         """One action from readings [R] m, clear lengths [D] m and where the goal is, m and rad."""
         self._locate_goal(distance, heading)
-        if not self.turns_left and not (self.then_drive and clear[0] >= self.needed):
+        if not self.turns_left and not (self.then_forward and clear[0] >= self.needed):
             direction = self._decide(readings, clear)
             self.turns_left = round(math.remainder(direction, 2 * math.pi) / self.turn)
         if self.turns_left:
-            # The drive belongs to the turn: without it two choices could alternate on the spot.
-            self.then_drive = True
+            # The move belongs to the turn: without it two choices could alternate on the spot.
+            self.then_forward = True
             sign = 1 if self.turns_left > 0 else -1
             self.turns_left -= sign
             self.heading += sign * self.turn
             self.wall -= sign * self.turn
             return LEFT if sign > 0 else RIGHT
-        self.then_drive = False
+        self.then_forward = False
         if clear[0] < self.needed:
             return self._escape(clear)
         self.place += cmath.rect(self.stride, self.heading)
-        self.driven = self.heading
+        self.last_heading = self.heading
         return FORWARD
 
     def _escape(self, clear: Floats) -> int:
-        """What is left when no direction is clear enough to drive."""
-        if clear[self.count // 2] >= self.reverse + FRONT_ROOM:
+        """What is left when no direction is clear enough to move."""
+        if clear[self.count // 2] >= self.reverse + FRONT_CLEARANCE:
             self.place -= cmath.rect(self.reverse, self.heading)
             return BACKWARD
         return STAND
@@ -175,7 +175,7 @@ class _Robot:
         self.nearest = min(self.nearest, distance)
 
     def _decide(self, readings: Floats, clear: Floats) -> float:
-        """The direction to drive in."""
+        """The direction to move in."""
         onward = np.cos(self.bug.directions - self.bearing)
         length = np.clip(self.distance * onward, 0, clear)
         left = np.sqrt(self.distance**2 - 2 * self.distance * length * onward + length**2)
@@ -184,39 +184,39 @@ class _Robot:
             self.mode = "go"
             passes = self.distance * abs(math.sin(self.bearing)) < self.bug.config.goal_radius * 0.7
             straight = passes and abs(self.bearing) < math.pi / 4 and clear[0] >= self.needed
-            return 0.0 if straight else self._towards(self.bearing, clear)
+            return 0.0 if straight else self._toward(self.bearing, clear)
         if self.mode == "follow" and left.min() < self.nearest - PROGRESS:
             best = int(left.argmin())
             direction = self.heading + float(self.bug.directions[best])
             self.crossing_to = self.place + cmath.rect(float(length[best]), direction)
             self.crossing_left, self.mode = CROSSING_STEPS, "cross"
         if self.mode == "cross":
-            way = self.crossing_to - self.place
+            offset = self.crossing_to - self.place
             self.crossing_left -= 1
-            if abs(way) > self.stride and self.crossing_left > 0:
-                return self._towards(cmath.phase(way) - self.heading, clear)
+            if abs(offset) > self.stride and self.crossing_left > 0:
+                return self._toward(cmath.phase(offset) - self.heading, clear)
             self.mode = "go"
         if self.mode == "go":
             hand, edge = self._nearer_edge(clear, ahead)
             self.hand = hand
             if edge is not None and left[edge] < self.distance - PROGRESS / 2:
-                return self._towards(float(self.bug.directions[edge]), clear)
+                return self._toward(float(self.bug.directions[edge]), clear)
             best = int(left.argmin())
             if left[best] < self.distance - CLOSE_UP:
-                return self._towards(float(self.bug.directions[best]), clear)
+                return self._toward(float(self.bug.directions[best]), clear)
             self.mode, self.wall = "follow", self.bearing
             self.visited.clear()
             self.nearest = min(self.nearest, float(left.min()))
         return self._along_wall(readings, clear)
 
     def _nearer_edge(self, clear: Floats, ahead: int) -> tuple[int, int | None]:
-        """On which hand the obstacle ahead is passed on the shorter way, and the direction there.
+        """On which hand the obstacle ahead is passed on the shorter path, and the direction there.
 
-        The way leads beside the obstacle's end and from there straight to the goal; the hand of
+        The path leads beside the obstacle's end and from there straight to the goal; the hand of
         before has an advantage, so that small changes do not reverse it.
         """
         best = math.inf
-        found: tuple[int, int | None] = (self.hand, None)
+        choice: tuple[int, int | None] = (self.hand, None)
         for hand in (1, -1):
             for k in range(1, self.count // 2):
                 beside, beyond = (ahead + hand * (k - 1)) % self.count, (ahead + hand * k)
@@ -228,9 +228,9 @@ class _Robot:
                 rest = abs(self.distance - cmath.rect(to_edge, angle))
                 cost = to_edge + rest + (EDGE if hand != self.hand else 0.0)
                 if cost < best:
-                    best, found = cost, (hand, beyond)
+                    best, choice = cost, (hand, beyond)
                 break
-        return found
+        return choice
 
     def _along_wall(self, readings: Floats, clear: Floats) -> float:
         """The direction nearest to the followed wall that is clear, counted away from it."""
@@ -242,8 +242,8 @@ class _Robot:
             self.wall = float(self.bug.beams[near[readings[near].argmin()]])
         first = round(self.wall / self.turn)
         headings = (first + self.hand * np.arange(self.count // FINENESS)) * FINENESS % self.count
-        wide = self.bug.clear_lengths(readings[None], WALL_ROOM)[0]
-        turned = self.bug.directions[headings] + self.heading - self.driven
+        wide = self.bug.clear_lengths(readings[None], WALL_CLEARANCE)[0]
+        turned = self.bug.directions[headings] + self.heading - self.last_heading
         onward = np.cos(turned) > math.cos(math.pi - RETURN)
         # In a notch the nearest wall may be the one left behind: back only if nothing else is.
         roomy, narrow = wide[headings] >= HUG, clear[headings] >= self.needed
@@ -265,15 +265,15 @@ class _Robot:
         """Leave a circle, mostly a bay too small to turn in, to the open; then the other hand."""
         self.visited.clear()
         self.hand, self.mode, self.crossing_left = -self.hand, "cross", CROSSING_STEPS
-        onward = np.cos(self.bug.directions + self.heading - self.driven)
+        onward = np.cos(self.bug.directions + self.heading - self.last_heading)
         best = int((clear + 0.1 * onward).argmax())
         direction = float(self.bug.directions[best])
         length = min(float(clear[best]), BREAK_OUT)
         self.crossing_to = self.place + cmath.rect(length, self.heading + direction)
-        return self._towards(direction, clear)
+        return self._toward(direction, clear)
 
-    def _towards(self, direction: float, clear: Floats) -> float:
-        """The heading that can be driven nearest to a direction, the present one preferred."""
+    def _toward(self, direction: float, clear: Floats) -> float:
+        """The heading that is clear and nearest to a direction, the present one preferred."""
         if abs(wrap_angle(direction)) < STEADY * self.turn and clear[0] >= self.needed:
             return 0.0
         headings = np.arange(0, self.count, FINENESS)

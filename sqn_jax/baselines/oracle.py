@@ -1,12 +1,12 @@
 """The oracle: it knows the map and where it is, and gives the fewest time steps one can hope for.
 
 How the oracle plans. A beam search goes forward from the robot's pose through the simulator's own
-motions (drive, reverse, turn; the real pose, nothing rounded; a move counts as possible if the
+motions (forward, backward, turn; the real pose, nothing rounded; a move counts as possible if the
 simulator would grant it). All poses in the beam have taken equally many steps, so they compete by
-an estimate of what is left: the shortest way to the goal over the map, the turn towards that way,
+an estimate of what is left: the shortest path to the goal over the map, the turn toward that path,
 and the bends along it. Without noise a plan holds to the end, but for the rare move that the
 simulator's single precision refuses: it is then planned anew without that move. With noise on the
-velocity a short search mends the plan after each step. Beam search is not proven optimal: see
+velocity a short search repairs the plan after each step. Beam search is not proven optimal: see
 `tests/baselines/test_oracle.py` for how it stands to a full search on a lattice.
 """
 
@@ -30,13 +30,13 @@ Ints = NDArray[np.int64]
 INVERSE = np.array([-1, BACKWARD, FORWARD, RIGHT, LEFT])
 
 BEAM = 100
-"""Poses kept an episode and step while the whole way is planned."""
-MENDING_BEAM = 40
-MENDING_STEPS = 14
+"""Poses per episode and step while the whole path is planned."""
+REPAIR_BEAM = 40
+REPAIR_STEPS = 14
 """Size of the search after a step that led elsewhere than planned."""
 ON_PLAN = 1e-3
 """A pose this near to the planned one, m and rad, is the planned one."""
-SIDE_ROOM = 1e-3
+SIDE_MARGIN = 1e-3
 """m that a planned move keeps from obstacles, so that float32 in the simulator agrees."""
 
 
@@ -48,7 +48,7 @@ class Oracle:
         self.search = BeamSearch(occupancy_map, env_params, goals)
         self.goals = goals
         self.steps_left = env_params.max_steps
-        self.mends = env_params.config.velocity_noise > 0
+        self.repairs = env_params.config.velocity_noise > 0
         self.arrived = np.zeros(len(goals), dtype=bool)
         self.actions: list[Ints] = [np.empty(0, np.int64)] * len(goals)
         self.planned: list[Floats] = [np.empty((0, 3))] * len(goals)
@@ -57,7 +57,7 @@ class Oracle:
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
         self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.search.goal_radius
-        if self.before is not None and not self.mends:
+        if self.before is not None and not self.repairs:
             self._note_refusals(poses, *self.before)
         lost = [i for i in np.flatnonzero(~self.arrived) if not self._is_on_plan(int(i), poses[i])]
         if lost:
@@ -81,22 +81,22 @@ class Oracle:
         return len(self.actions[robot]) > 0 and bool(_is_at(pose, self.planned[robot][0]))
 
     def _plan(self, robots: Ints, poses: Floats) -> None:
-        """Whole ways, with a wider beam if need be; mending ones under noise, but for the first."""
+        """Whole paths, with a wider beam if need be; under noise repaired, except the first."""
         attempts = [(BEAM, self.steps_left), (4 * BEAM, self.steps_left)]
-        if self.mends and self.before is not None:
-            attempts = [(MENDING_BEAM, min(MENDING_STEPS, self.steps_left))]
+        if self.repairs and self.before is not None:
+            attempts = [(REPAIR_BEAM, min(REPAIR_STEPS, self.steps_left))]
         for width, steps in attempts:
             plans = self.search.plan(robots, poses, steps=steps, width=width)
             for robot, (actions, planned, _) in zip(robots, plans, strict=True):
                 self.actions[robot], self.planned[robot] = actions, planned
-            failed = np.array([not found for _, _, found in plans])
+            failed = np.array([not reached for _, _, reached in plans])
             robots, poses = robots[failed], poses[failed]
             if not robots.size:
                 return
 
 
 class _Beam(NamedTuple):
-    """The poses [P] that the search goes on from; all have taken equally many steps."""
+    """The poses [P] that the search continues from; all have taken equally many steps."""
 
     robot: Ints
     """Whose they are."""
@@ -115,7 +115,7 @@ class _Beam(NamedTuple):
 
 
 class BeamSearch:
-    """Searches forward from given poses towards given goals, for many robots at once."""
+    """Searches forward from given poses toward given goals, for many robots at once."""
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
         config = env_params.config
@@ -129,12 +129,12 @@ class BeamSearch:
         self.backward = config.backward_speed * config.time_step
         self.turn = config.turn_rate * config.time_step
         if min(self.forward, self.backward, self.turn) <= 0:
-            raise ValueError("the robot cannot drive or turn, expected speeds above 0")
+            raise ValueError("the robot cannot move or turn, expected speeds above 0")
         self.goal_radius = float(env_params.goal_radius)
         self.resolution = occupancy_map.resolution
         self.free = traversable(occupancy_map.occupied, self.resolution, config.robot_radius)
         # Distance in m from a point of a cell to cells that are not free, at least.
-        self.room = (ndimage.distance_transform_edt(self.free) - np.sqrt(2)) * self.resolution
+        self.clearance = (ndimage.distance_transform_edt(self.free) - np.sqrt(2)) * self.resolution
         self.goals = goals
         self.refused: list[tuple[int, Floats, int]] = []
         """Moves to leave out: robot, pose, action."""
@@ -149,14 +149,14 @@ class BeamSearch:
             robots: [N] which of the goals each one has.
             poses: [N, 3] where they are.
             steps: how far ahead, at most.
-            width: poses kept a robot and step.
+            width: poses per robot and step.
 
         Returns:
             For each robot its actions [S], the poses [S, 3] before each of them, and whether they
             lead to the goal; if not, they lead to the best place within `steps`.
         """
-        nobody = np.zeros(len(robots), np.int64)
-        beam = _Beam(np.arange(len(robots)), nobody, nobody, poses, nobody)
+        zeros = np.zeros(len(robots), np.int64)
+        beam = _Beam(np.arange(len(robots)), zeros, zeros, poses, zeros)
         beams, alive = [beam], beam.robot
         ends = np.zeros((len(robots), 2), np.int64)
         reached = np.zeros(len(robots), bool)
@@ -232,49 +232,49 @@ class BeamSearch:
         rank = np.arange(len(order)) - np.searchsorted(owner, owner)
         return order[rank < width]
 
-    def is_clear(self, pose: Floats, way: float) -> NDArray[np.bool_]:
-        """Whether the simulator grants a straight move from poses [N, 3] by `way` m, negative back.
+    def is_clear(self, pose: Floats, distance: float) -> NDArray[np.bool_]:
+        """Whether a straight move of `distance` m (< 0 is backward) from poses [N, 3] is allowed.
 
-        Slightly stricter: two lines, `SIDE_ROOM` to the left and right, must not meet a cell that
-        is not free, and neither must the next millimetre.
+        Slightly stricter: two lines, `SIDE_MARGIN` to the left and right, must not meet a cell that
+        is not free, and neither must the next millimeter.
         """
-        direction = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1) * np.sign(way)
-        length = abs(way) + 1e-3
+        direction = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1) * np.sign(distance)
+        length = abs(distance) + 1e-3
         col, row = (
             np.floor((pose[:, :2] + direction * (length / 2)) / self.resolution).astype(int).T
         )
         row = np.clip(row, 0, self.free.shape[0] - 1)
         col = np.clip(col, 0, self.free.shape[1] - 1)
-        clear = self.room[row, col] > length / 2 + SIDE_ROOM
+        clear = self.clearance[row, col] > length / 2 + SIDE_MARGIN
         near = np.flatnonzero(~clear)
         start, ahead = pose[near, :2], direction[near]
-        aside = SIDE_ROOM * np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+        aside = SIDE_MARGIN * np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
         clear[near] = self._line_is_free(start + aside, ahead * length)
         clear[near] &= self._line_is_free(start - aside, ahead * length)
         return clear
 
-    def _line_is_free(self, start: Floats, way: Floats) -> NDArray[np.bool_]:
+    def _line_is_free(self, start: Floats, line: Floats) -> NDArray[np.bool_]:
         """Whether every cell that segments [N, 2] cross is free; beyond the border nothing is."""
-        start, way = start / self.resolution, way / self.resolution
-        most = int(np.ceil(np.abs(way).max(initial=0.0))) + 1
-        # Borders crossed, as shares of the way; between two of them lies one cell.
+        start, line = start / self.resolution, line / self.resolution
+        most = int(np.ceil(np.abs(line).max(initial=0.0))) + 1
+        # Borders crossed, as fractions of the line; between two of them lies one cell.
         with np.errstate(divide="ignore", invalid="ignore"):
-            upwards = way[..., None] > 0
+            upwards = line[..., None] > 0
             border = np.floor(start)[..., None] + np.where(
                 upwards, np.arange(1, most + 1), -np.arange(most)
             )
-            shares = (border - start[..., None]) / way[..., None]
-        shares = np.where(way[..., None] == 0, 1.0, np.clip(shares, 0.0, 1.0))
+            fractions = (border - start[..., None]) / line[..., None]
+        fractions = np.where(line[..., None] == 0, 1.0, np.clip(fractions, 0.0, 1.0))
         ends = np.tile([0.0, 1.0], (len(start), 1))
-        shares = np.sort(
-            np.concatenate([shares.reshape(len(start), 2 * most), ends], axis=1), axis=1
+        fractions = np.sort(
+            np.concatenate([fractions.reshape(len(start), 2 * most), ends], axis=1), axis=1
         )
-        middle = (shares[:, 1:] + shares[:, :-1]) / 2
-        col = np.floor(start[:, :1] + way[:, :1] * middle).astype(np.int64)
-        row = np.floor(start[:, 1:] + way[:, 1:] * middle).astype(np.int64)
+        middle = (fractions[:, 1:] + fractions[:, :-1]) / 2
+        col = np.floor(start[:, :1] + line[:, :1] * middle).astype(np.int64)
+        row = np.floor(start[:, 1:] + line[:, 1:] * middle).astype(np.int64)
         row = np.clip(row, 0, self.free.shape[0] - 1)
         col = np.clip(col, 0, self.free.shape[1] - 1)
-        empty = shares[:, 1:] - shares[:, :-1] < 1e-12
+        empty = fractions[:, 1:] - fractions[:, :-1] < 1e-12
         return np.asarray((self.free[row, col] | empty).all(axis=1))
 
 

@@ -1,7 +1,7 @@
 """Shortest paths over a map: how long they are, and how many steps a robot needs along them.
 
 Nothing is searched over headings here: what is left of a path is estimated from its length, the
-turn towards it and its bends, which steers the search of `oracle.Oracle`.
+turn toward it and its bends, which steers the search of `oracle.Oracle`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ShortestPaths:
         self.which = np.empty(len(goals), np.int64)
         self.resolution, self.turn = resolution, turn
         rows, cols = np.nonzero(free)
-        self.centres = np.stack([cols + 0.5, rows + 0.5], axis=-1) * resolution
+        self.centers = np.stack([cols + 0.5, rows + 0.5], axis=-1) * resolution
         self.index = np.full(free.shape, -1, np.int64)
         self.index[rows, cols] = np.arange(len(rows))
         self._neighbors = [
@@ -83,13 +83,13 @@ class ShortestPaths:
             through = np.where(neighbor >= 0, length[neighbor] + step, np.inf)
             better = through < best
             best[better], onward[better] = through[better], neighbor[better]
-        to_goal = goal - self.centres
+        to_goal = goal - self.centers
         straight = np.hypot(*to_goal.T)
         sees_goal = ~(length > straight + 1e-3 * self.resolution)
         onward = np.where(sees_goal | ~np.isfinite(length), np.arange(len(length)), onward)
         for _ in range(JUMPS):
             onward = onward[onward]
-        ahead = np.where(sees_goal[:, None], to_goal, self.centres[onward] - self.centres)
+        ahead = np.where(sees_goal[:, None], to_goal, self.centers[onward] - self.centers)
         direction = np.arctan2(ahead[:, 1], ahead[:, 0])
         bend = np.abs(wrap_angle(direction[onward] - direction))
         bends = np.maximum(bend - BEND_SLACK, 0.0) / self.turn
@@ -107,8 +107,8 @@ class ShortestPaths:
         col, row = np.floor(pose[:, :2] / self.resolution).astype(np.int64).T
         cell, field = self.index[row, col], self.which[robots]
         direction = self.direction[field, cell].astype(np.float64)
-        away = pose[:, :2] - self.centres[cell]
-        # From the cell's centre to the place itself.
+        away = pose[:, :2] - self.centers[cell]
+        # From the cell's center to the place itself.
         length = self.length[field, cell] - (
             away[:, 0] * np.cos(direction) + away[:, 1] * np.sin(direction)
         )

@@ -57,7 +57,7 @@ def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
 def _checked(value: Any, hint: Any, label: str) -> Any:
     """Check one leaf against its annotation; whole numbers pass where a float is asked for."""
     if typing.get_origin(hint) is Literal:
-        return value  # The dataclass checks its words itself.
+        return value  # The dataclass checks its own choices.
     assert not isinstance(hint, types.UnionType), "config fields have one type"
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)

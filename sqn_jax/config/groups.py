@@ -8,7 +8,7 @@ from typing import Literal
 
 from sqn_jax.config.validation import (
     require,
-    require_known_words,
+    require_known_choices,
     require_not_negative,
     require_positive,
 )
@@ -21,7 +21,7 @@ class EnvConfig:
     num_beams: int = 71
     """Range beams, evenly spaced over the field of view."""
     field_of_view_deg: float = 350.0
-    """Angle from the first to the last beam, centred on the heading, degrees."""
+    """Angle from the first to the last beam, centered on the heading, degrees."""
     max_range: float = 5.0
     """Farthest range a beam reads, m."""
     forward_speed: float = 2.5
@@ -37,7 +37,7 @@ class EnvConfig:
     goal_radius: float = 0.3
     """The goal counts as reached within this distance, m."""
     max_goal_distance: float = 24.0
-    """Goal distance at which the normalised observation reaches 1, m (17 m x sqrt 2)."""
+    """Goal distance at which the normalized observation reaches 1, m (17 m x sqrt 2)."""
     heading_encoding: Literal["linear", "sincos"] = "linear"
     """Goal heading as one number (psi + pi) / 2 pi, or as sine and cosine scaled to 0..1."""
     max_steps: int = 0
@@ -51,7 +51,7 @@ class EnvConfig:
     velocity_noise: float = 0.0
     """Sigma of Gaussian noise on the executed velocity."""
     velocity_noise_unit: Literal["relative", "absolute"] = "relative"
-    """Sigma as a share of (forward_speed, turn_rate), or in m/s and rad/s."""
+    """Sigma as a fraction of (forward_speed, turn_rate), or in m/s and rad/s."""
     range_noise: float = 0.0
     """Half-width p of the uniform noise on the observed ranges."""
     range_noise_unit: Literal["relative", "absolute"] = "relative"
@@ -74,7 +74,7 @@ class EnvConfig:
         for name in ("reward_navigation", "reward_exploration", "reward_time"):
             value = getattr(self, name)
             require(math.isfinite(value), f"env.{name}", value, "a finite number")
-        require_known_words(self, "env")
+        require_known_choices(self, "env")
         value = self.near_goal_fraction
         require(0 <= value <= 1, "env.near_goal_fraction", value, "a number from 0 to 1")
         require(self.num_beams >= 2, "env.num_beams", self.num_beams, "at least 2")
@@ -96,7 +96,7 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class RandomizationConfig:
-    """How the worlds of the parallel robots differ in training (domain randomisation).
+    """How the worlds of the parallel robots differ in training (domain randomization).
 
     Each robot keeps its own world for the whole run. Evaluations have none of this.
     """
@@ -106,7 +106,7 @@ class RandomizationConfig:
     range_noise: float = 0.0
     """Half-width of each robot's range noise, from 0 to this; in place of `env.range_noise`."""
     speed: float = 0.0
-    """Each robot's speeds and turn rate are up to this share faster or slower."""
+    """Each robot's speeds and turn rate are up to this fraction faster or slower."""
     mirror: bool = False
     """Half of the robots live in the mirror image of the map."""
 
@@ -125,7 +125,7 @@ class NetworkConfig:
     num_skills: int = 2
     """Latent skill policies N of the SQN."""
     layer_norm: bool = False
-    """Layer normalisation before each ReLU; recurrent PQN needs it, the paper has none."""
+    """Layer normalization before each ReLU; recurrent PQN needs it, the paper has none."""
     dqn_width_factor: int = 3
     """How much wider the DQN's layers after the features are (paper section IV-D)."""
 
@@ -140,7 +140,7 @@ class ReplayConfig:
     """Whole-episode replay with priorities (used by the method `r2d2`)."""
 
     capacity: int = 10_000
-    """Episodes kept; the oldest make room for the newest."""
+    """Episodes in the replay memory; the oldest make room for the newest."""
     min_episodes: int = 100
     """Updates begin once this many episodes are stored."""
     prioritized: bool = True
@@ -150,7 +150,7 @@ class ReplayConfig:
     importance_exponent: float = 0.6
     """Exponent of the importance-sampling weights (R2D2, table 2)."""
     max_priority_weight: float = 0.9
-    """Priority of a sequence: this share of the largest TD error, the rest of the mean one."""
+    """Priority of a sequence: this fraction of the largest TD error, the rest of the mean one."""
 
     def __post_init__(self) -> None:
         require(self.capacity >= 1, "replay.capacity", self.capacity, "at least 1")
@@ -196,9 +196,9 @@ class LearnerConfig:
     trace_decay: float = 0.8
     """pqn: lambda of the Q(lambda) returns."""
     average_share: float = 0.0
-    """pqn: evaluate the parameters averaged over the last share of all updates; 0: the latest."""
+    """pqn: evaluate the parameters averaged over this last fraction of updates; 0: the latest."""
     window_length: int = 0
-    """pqn: steps driven between updates, a divisor of the episode; 0 is the whole episode."""
+    """pqn: steps between updates, a divisor of the episode; 0 is the whole episode."""
     num_passes: int = 1
     """pqn: how often each step is learned from."""
     restart_at_goal: bool = False
@@ -207,7 +207,7 @@ class LearnerConfig:
     """Alpha of advantage learning, which widens the gaps between actions; 0: plain Q-learning."""
 
     def __post_init__(self) -> None:
-        require_known_words(self, "learner")
+        require_known_choices(self, "learner")
         for name in ("learning_rate", "adam_epsilon", "max_grad_norm"):
             require_positive(self, "learner", name)
         for name in ("batch_size", "n_step", "num_passes"):
@@ -216,8 +216,8 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             require(value >= 0, f"learner.{name}", value, "0 or a positive number")
-        shares = ("trace_decay", "average_share", "advantage_learning")
-        for name in ("discount", "discount_start", *shares):
+        fractions = ("trace_decay", "average_share", "advantage_learning")
+        for name in ("discount", "discount_start", *fractions):
             value = getattr(self, name)
             require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         value = self.target_update_rate

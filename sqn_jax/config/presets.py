@@ -51,7 +51,7 @@ def _best() -> TrainConfig:
         map="maze*8,maze:0-24,column:0-2,forest:0-6,cave:0-11",
         total_episodes=102_400,
         randomization=RandomizationConfig(mirror=True),
-        # Half of the run with hardly any chance: robots get stuck while there is time to learn.
+        # Hardly any random actions in half of the run: robots get stuck in time to learn from it.
         exploration=dataclasses.replace(quick.exploration, decay_fraction=0.5),
     )
 

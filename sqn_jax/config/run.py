@@ -19,7 +19,7 @@ from sqn_jax.config.groups import (
 from sqn_jax.config.map_names import MapSet, parse
 from sqn_jax.config.validation import (
     require,
-    require_known_words,
+    require_known_choices,
     require_not_negative,
     require_positive,
 )
@@ -50,7 +50,7 @@ class TrainConfig:
     total_episodes: int = 10_000
     """Training episodes of each run."""
     num_envs: int = 50
-    """Robots that drive side by side; each round is one whole episode of all of them."""
+    """Envs that run in parallel; each round is one whole episode of all of them."""
     updates_per_round: int = 50
     """r2d2: updates after each round."""
     rounds_per_chunk: int = 1
@@ -58,7 +58,7 @@ class TrainConfig:
     checkpoint_minutes: float = 10.0
     """Minutes between checkpoints; one is always written at the end."""
     checkpoint_replay: bool = True
-    """r2d2: save the replay, too; else a run goes on from an empty one, not as it would have."""
+    """r2d2: save the replay, too; else a run resumes with an empty one, and differs."""
     max_skipped_updates: int = 100
     """Stop once more updates than this had a loss or gradient that is not finite."""
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -70,7 +70,7 @@ class TrainConfig:
     eval: EvalConfig = field(default_factory=EvalConfig)
 
     def __post_init__(self) -> None:
-        require_known_words(self, "")
+        require_known_choices(self, "")
         # Equal maps are equal settings, however they were written.
         object.__setattr__(self, "map", str(self.maps))
         require(0 <= self.seed < 2**31, "seed", self.seed, "a number from 0 to 2147483647")

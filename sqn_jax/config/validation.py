@@ -13,13 +13,13 @@ def require(condition: bool, name: str, value: object, expected: str) -> None:
         raise ValueError(f"{name} is {value!r}, expected {expected}")
 
 
-def require_known_words(config: object, group: str) -> None:
-    """Check every field that is one of a few words."""
+def require_known_choices(config: object, group: str) -> None:
+    """Check every field that takes one of a few strings."""
     for name, hint in typing.get_type_hints(type(config)).items():
         if typing.get_origin(hint) is Literal:
-            words = typing.get_args(hint)
+            choices = typing.get_args(hint)
             value = getattr(config, name)
-            require(value in words, _label(group, name), value, f"one of {', '.join(words)}")
+            require(value in choices, _label(group, name), value, f"one of {', '.join(choices)}")
 
 
 def _label(group: str, name: str) -> str:

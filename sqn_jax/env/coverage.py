@@ -36,7 +36,7 @@ LATTICE_ANGLE = math.atan(GOLDEN_RATIO)
 any: no ratio is farther from all simple fractions."""
 
 ROW_BITS = 31
-"""Points in a word of a scan; a power of two for the place after the last still fits 32 bits."""
+"""Points in a bitmask of a scan; a power of two for the place after the last still fits 32 bits."""
 
 LARGEST_BLOCK = 20
 """Sectors that are drawn in one pass of a loop; all in one would take long to compile."""
@@ -49,8 +49,8 @@ FAR = 1e9
 class Lattice:
     """Where the points of a map lie and how they are stored; static.
 
-    In the lattice's own frame, in cells, point m of row n is at (m, n). Words of 32 points fill a
-    `covered` array [words, groups, group_rows] uint32: bit b of `covered[k, g, p]` is point
+    In the lattice's own frame, in cells, point m of row n is at (m, n). Bitmasks of 32 points fill
+    a `covered` array [bitmasks, groups, group_rows] uint32: bit b of `covered[k, g, p]` is point
     32 k + b of row g x group_rows + p.
     """
 
@@ -59,19 +59,19 @@ class Lattice:
     width: float
     """Extent of the map along x, m."""
     cell: float
-    """Distance of neighbouring points, m."""
+    """Distance of neighboring points, m."""
     max_range: float
     """Farthest reading of the sensor, m."""
     origin: tuple[float, float]
     """Where the map's corner (0, 0) lies in the lattice's frame, cells."""
-    num_words: int
-    """Words in a row."""
+    num_bitmasks: int
+    """Bitmasks in a row."""
     num_groups: int
     """Groups of rows."""
 
     @classmethod
     def over(cls, height_m: float, width_m: float, cell: float, max_range: float) -> Self:
-        """The lattice for a map of `height_m` x `width_m` metres."""
+        """The lattice for a map of `height_m` x `width_m` meters."""
         corners = _turn(np.array([0.0, width_m, 0.0, width_m]), np.array([0, 0, 1, 1]) * height_m)
         left, bottom = (math.floor(axis.min() / cell) - 1 for axis in corners)
         columns, rows = (
@@ -84,7 +84,7 @@ class Lattice:
             cell=cell,
             max_range=max_range,
             origin=(-left, -bottom),
-            num_words=math.ceil(columns / 32),
+            num_bitmasks=math.ceil(columns / 32),
             num_groups=math.ceil(rows / group_rows),
         )
 
@@ -96,17 +96,17 @@ class Lattice:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape of a `covered` array."""
-        return self.num_words, self.num_groups, self.group_rows
+        return self.num_bitmasks, self.num_groups, self.group_rows
 
     @property
     def stride(self) -> int:
-        """Words are numbered group by group, with a number between groups that stands for none."""
-        return self.num_words + 1
+        """Bitmasks are numbered group by group; one number between two groups stands for none."""
+        return self.num_bitmasks + 1
 
     def points(self) -> NDArray[np.float64]:
-        """Places of all points on the map, [words, groups, group_rows, 32, 2] x m, y m."""
+        """Places of all points on the map, [bitmasks, groups, group_rows, 32, 2] x m, y m."""
         rows = np.arange(self.num_groups * self.group_rows).reshape(1, *self.shape[1:], 1)
-        columns = np.arange(self.num_words * 32).reshape(-1, 1, 1, 32)
+        columns = np.arange(self.num_bitmasks * 32).reshape(-1, 1, 1, 32)
         u, v = (columns - self.origin[0]) * self.cell, (rows - self.origin[1]) * self.cell
         return np.stack(np.broadcast_arrays(*_turn(u, v, back=True)), axis=-1)
 
@@ -120,7 +120,7 @@ class Lattice:
             y: m, the same shape.
 
         Returns:
-            Indices of words, groups, group_rows and bits, of that shape each.
+            Indices of bitmasks, groups, group_rows and bits, of that shape each.
         """
         u, v = _turn(x, y)
         column = np.rint(u / self.cell + self.origin[0]).astype(np.intp)
@@ -150,7 +150,7 @@ def add_scan(
     """Mark what a scan sees.
 
     Args:
-        covered: [words, groups, group_rows] uint32, the coverage so far.
+        covered: [bitmasks, groups, group_rows] uint32, the coverage so far.
         pose: [3] x m, y m, heading rad.
         ranges: [R] true readings, m, from the rightmost beam to the leftmost.
         field_of_view: angle from the first beam to the last, rad.
@@ -214,7 +214,7 @@ def _sectors(heading: Array, reaches: Array, field_of_view: float) -> Array:
 def _sector_limits(num_beams: int, field_of_view: float) -> tuple[NDArray[np.float32], int]:
     """Where the sectors begin, rad from the heading, and how many can touch a half-plane.
 
-    One sector a beam, its neighbours halfway; those of the outermost beams end at the field of
+    One sector a beam, its neighbors halfway; those of the outermost beams end at the field of
     view. The last of the [R + 1] sectors is what lies beyond it and cannot be seen.
     """
     spacing = field_of_view / (num_beams - 1)
@@ -243,9 +243,9 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
     row's place on the map needs no look-up, only the right group.
 
     Returns:
-        For W words of `ROW_BITS` points of each row in reach: which word of the lattice, counted
-        with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it [W]
-        uint32; and the points that are seen, W times [2, group_rows] uint32.
+        For W bitmasks of `ROW_BITS` points of each row in reach: which bitmask of the lattice,
+        counted with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it
+        [W] uint32; and the points that are seen, W times [2, group_rows] uint32.
     """
     radius = lattice.max_range / lattice.cell
     places = jnp.arange(lattice.group_rows, dtype=jnp.float32)
@@ -253,11 +253,11 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
     above = lowest + lattice.group_rows * fraction((places - lowest) / lattice.group_rows)
     rows = jnp.floor(above[None] + np.array([[0.5], [0.5 - lattice.group_rows]], np.float32))
     own_groups = jnp.floor((rows + 0.5) / lattice.group_rows)
-    num_words = math.ceil(2 * radius / ROW_BITS)
-    first_points = jnp.ceil(u - radius) + ROW_BITS * np.arange(num_words, dtype=np.float32)
-    own_words = jnp.floor(first_points / 32)
-    on_map = (own_words >= -1) & (own_words < lattice.num_words)
-    numbers = own_words[:, None, None] + lattice.stride * own_groups[None]
+    num_bitmasks = math.ceil(2 * radius / ROW_BITS)
+    first_points = jnp.ceil(u - radius) + ROW_BITS * np.arange(num_bitmasks, dtype=np.float32)
+    own_bitmasks = jnp.floor(first_points / 32)
+    on_map = (own_bitmasks >= -1) & (own_bitmasks < lattice.num_bitmasks)
+    numbers = own_bitmasks[:, None, None] + lattice.stride * own_groups[None]
     numbers = to_integer(jnp.where(on_map[:, None, None], numbers, -9.0))
 
     num_blocks = math.ceil(sectors.shape[1] / LARGEST_BLOCK)
@@ -269,24 +269,24 @@ def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, 
     draw = partial(_draw_block, rows=rows - v, starts=first_points - 0.5 - u, block=block)
     # The first sector above the robot begins at the far right, the first one below at the left.
     begin = jnp.broadcast_to(np.array([[FAR], [-FAR]], np.float32), rows.shape)
-    nothing = [jnp.zeros(rows.shape, jnp.uint32)] * num_words
+    nothing = [jnp.zeros(rows.shape, jnp.uint32)] * num_bitmasks
 
     def draw_next(index: Array | int, carry: Any) -> Any:
-        begin, words, _ = carry
+        begin, bitmasks, _ = carry
         part = jax.lax.dynamic_slice_in_dim(sectors, index * block, block, axis=1)
         # What comes out of a loop is not merged into what follows and computed there once more for
-        # each word of the map; so the numbers come out of it, too.
-        return *draw(begin, words, part), numbers
+        # each bitmask of the map; so the numbers come out of it, too.
+        return *draw(begin, bitmasks, part), numbers
 
     start = (begin, nothing, jnp.zeros_like(numbers))
-    _, words, numbers = repeat(num_blocks, draw_next, start, unroll=1)
-    return numbers, to_integer(first_points - 32 * own_words).astype(jnp.uint32), words
+    _, bitmasks, numbers = repeat(num_blocks, draw_next, start, unroll=1)
+    return numbers, to_integer(first_points - 32 * own_bitmasks).astype(jnp.uint32), bitmasks
 
 
 def _draw_block(
-    begin: Array, words: list[Array], sectors: Array, *, rows: Array, starts: Array, block: int
+    begin: Array, bitmasks: list[Array], sectors: Array, *, rows: Array, starts: Array, block: int
 ) -> tuple[Array, list[Array]]:
-    """Add a block of sectors to the words; returns where the last one ended, and the words."""
+    """Add a block of sectors to the bitmasks; returns the end of the last one, and the bitmasks."""
     squares = rows * rows
     for sector in range(block):
         end = rows * sectors[:2, sector, None]
@@ -295,27 +295,27 @@ def _draw_block(
         chord = jnp.where(chord_squared < 0, -FAR, jnp.sqrt(larger(chord_squared, 0.0)))
         right = smaller(right, chord)
         left = smaller(larger(left, -chord), right)
-        words = [
-            word | _power(right - start) - _power(left - start)
-            for word, start in zip(words, starts, strict=True)
+        bitmasks = [
+            bitmask | _power(right - start) - _power(left - start)
+            for bitmask, start in zip(bitmasks, starts, strict=True)
         ]
         begin = end
-    return begin, words
+    return begin, bitmasks
 
 
 def _power(number: Array) -> Array:
     """2 to the number, rounded and clipped to 0..`ROW_BITS`, uint32."""
     clipped = smaller(larger(number, 0.0), float(ROW_BITS))
-    # The mask changes nothing but tells the compiler that no shift is too long.
+    # The mask changes nothing but shows the compiler that no shift is too long.
     return jnp.uint32(1) << (to_integer(clipped).astype(jnp.uint32) & 31)
 
 
-def _place(numbers: Array, bits: Array, words: list[Array], lattice: Lattice) -> Array:
-    """The drawn words where they belong on the map, and nothing seen around them."""
-    word, group = np.ogrid[: lattice.num_words, : lattice.num_groups]
-    own_number = (word + group * lattice.stride).astype(np.int32)[..., None]
+def _place(numbers: Array, bits: Array, bitmasks: list[Array], lattice: Lattice) -> Array:
+    """The drawn bitmasks where they belong on the map, and nothing seen around them."""
+    bitmask, group = np.ogrid[: lattice.num_bitmasks, : lattice.num_groups]
+    own_number = (bitmask + group * lattice.stride).astype(np.int32)[..., None]
     seen = jnp.zeros(lattice.shape, jnp.uint32)
-    for index, points in enumerate(words):
+    for index, points in enumerate(bitmasks):
         lower = points << bits[index]
         # Upwards in two steps: by 32 at once, where nothing is left over, is no shift.
         upper = points >> 1 >> (31 - bits[index])

@@ -1,4 +1,4 @@
-"""How the robot moves: unicycle motion with a collision check along the whole way."""
+"""How the robot moves: unicycle motion with a collision check along the whole path."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sqn_jax.env.raycast import RayGrid, cast_rays, is_blocked
 def move(
     pose: Array, velocity: Array, body_grid: RayGrid, *, time_step: Array, iterations: int
 ) -> tuple[Array, Array]:
-    """Drive for one step; a move into an occupied place is refused as a whole (section IV-A).
+    """Move for one step; a move into an occupied place is refused as a whole (section IV-A).
 
-    The robot follows an arc; its end is exact and its way is checked along the chord (the actions
-    of the paper either drive or turn, so arc and chord differ only under velocity noise). A
+    The robot follows an arc; its end is exact and its path is checked along the chord (the actions
+    of the paper either translate or turn, so arc and chord differ only under velocity noise). A
     refused move leaves the position as it was; the turn is made all the same.
 
     Args:
         pose: [3] x m, y m, heading rad.
         velocity: [2] forward speed m/s (negative is backward), turn rate rad/s.
-        body_grid: the places the robot's centre may not enter, as a `RayGrid`.
+        body_grid: the places the robot's center may not enter, as a `RayGrid`.
         time_step: s.
-        iterations: rectangles the way may cross; a longer way counts as blocked.
+        iterations: rectangles the path may cross; a longer path counts as blocked.
 
     Returns:
         The new pose, its heading in [-pi, pi), and whether a move was refused.
@@ -34,7 +34,7 @@ def move(
     length = jnp.abs(chord)
     direction = pose[2] + turn / 2
     travel = direction + jnp.where(chord < 0, jnp.pi, 0.0)
-    # Half a millimetre beyond the end, so that the new place is inside a free cell.
+    # Half a millimeter beyond the end, so that the new place is inside a free cell.
     needed = length + 5e-4
     clear = cast_rays(
         body_grid, pose[:2], travel[None], max_range=needed + 1e-3, iterations=iterations

@@ -1,7 +1,7 @@
 """The table that makes exact ray casting cheap: free rectangles, one per cell and direction.
 
 For each cell and each sector of directions the table holds the width and height, in cells, of an
-empty rectangle that has the cell in one corner and reaches out towards the sector. A ray that
+empty rectangle that has the cell in one corner and reaches out toward the sector. A ray that
 starts anywhere in the cell may go straight to the rectangle's far side without a look at the
 cells between, and the place where it leaves is known to floating-point accuracy. A grid traversal
 needs a hundred steps for 5 m of 5 cm cells; hopping from rectangle to rectangle needs about four.
@@ -23,8 +23,8 @@ def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDA
 
     Args:
         blocked: [H, W] cells a ray cannot enter; the border must be blocked.
-        sectors: directions told apart, a multiple of 4; sector s covers the angles
-            2 pi [s, s + 1) / sectors, counted from +x towards +y (increasing row).
+        sectors: directions distinguished, a multiple of 4; sector s covers the angles
+            2 pi [s, s + 1) / sectors, counted from +x toward +y (increasing row).
         reach: longest rectangle along the direction, cells, at most 250.
 
     Returns:
@@ -44,7 +44,7 @@ def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDA
     per_quadrant = sectors // 4
     table = np.empty((sectors, *blocked.shape), np.uint16)
     for quadrant, (step_y, step_x) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
-        # Mirror the map so that the quadrant looks towards +x, +y, and mirror the result back.
+        # Mirror the map so that the quadrant looks toward +x, +y, and mirror the result back.
         mirrored = _Sums(blocked[::step_y, ::step_x], reach)
         for offset in range(per_quadrant):
             # In quadrants 1 and 3 the mirror image runs through the angles backwards.
@@ -99,7 +99,7 @@ class _Sums:
         self.run_y = np.minimum(_run(blocked.T).T[self.free], reach)
 
     def largest_free(self, cosine: float, sine: float) -> NDArray[np.uint16]:
-        """The free rectangle from each cell towards +x, +y that takes a ray of the slope farthest.
+        """The free rectangle from each cell toward +x, +y that takes a ray of the slope farthest.
 
         Two shapes compete: along the direction with room to spare, since rays start anywhere in
         the cell, and a strip of one cell's width, which is all there is beside a wall.

@@ -1,4 +1,4 @@
-"""Angles and the goal as seen from the robot. Metres and radians, x forward, y to the left."""
+"""Angles and the goal as seen from the robot. Meters and radians, x forward, y to the left."""
 
 from __future__ import annotations
 

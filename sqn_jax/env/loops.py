@@ -22,5 +22,5 @@ def repeat(
     """
     looped = partial(jax.lax.fori_loop, 0, count, body, unroll=unroll)
     written_out = partial(jax.lax.fori_loop, 0, count, body, unroll=True)
-    told: Carry = jax.lax.platform_dependent(start, cuda=written_out, default=looped)
-    return told
+    result: Carry = jax.lax.platform_dependent(start, cuda=written_out, default=looped)
+    return result

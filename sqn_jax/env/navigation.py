@@ -1,6 +1,6 @@
 """Mapless navigation as pure functions: `reset`, `reset_to`, `step`.
 
-A robot with range beams and the goal's distance and heading drives through an occupancy grid.
+A robot with range beams and the goal's distance and heading moves through an occupancy grid.
 
 Observation: `Observation(ranges [71], goal [2])`, every number in 0..1.
 Action: 0 stand still, 1 forward 2.5 m/s, 2 backward 1.25 m/s, 3 turn left pi rad/s, 4 turn right.
@@ -8,8 +8,8 @@ Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (
 End: never terminated; truncated after `max_steps` steps. Reaching the goal does not end an
 episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
 
-Everything is for one robot; `jax.vmap` makes many. Positions are in metres from the map's lower
-left corner, headings in radians from +x towards +y.
+Everything is for one robot; `jax.vmap` makes many. Positions are in meters from the map's lower
+left corner, headings in radians from +x toward +y.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NUM_ACTIONS = 5
 STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
 ACTION_NAMES = ("stand still", "forward", "backward", "turn left", "turn right")
 MOTION_ITERATIONS = 12
-"""Free rectangles the way of one step may cross; a longer way counts as blocked."""
+"""Free rectangles the path of one step may cross; a longer path counts as blocked."""
 
 Info = dict[str, Array]
 
@@ -39,7 +39,7 @@ Info = dict[str, Array]
 def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     """Draw a start pose [3] and a goal [2] near two different spawn points (section IV-A).
 
-    Of a map that holds several, both lie in the same. A share of the tasks, none by default, has
+    Of a map that holds several, both lie in the same. A fraction of the tasks, none by default, has
     its goal near one of the closest spawn points.
     """
     keys = jax.random.split(key, 7)

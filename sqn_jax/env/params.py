@@ -21,7 +21,7 @@ class EnvParams:
     sight: RayGrid
     """The occupied cells, for range readings."""
     body: RayGrid
-    """The cells the robot's centre may not enter, for collisions."""
+    """The cells the robot's center may not enter, for collisions."""
     spawn_positions: Array
     """[S, M, 2] m: places to start or finish, grouped by spawn point, padded by repetition."""
     spawn_counts: Array
@@ -73,7 +73,7 @@ class EnvState:
     goal: Array
     """[2] x m, y m."""
     covered: Array
-    """[words, groups, group_rows] uint32: the points seen so far, one a bit; see `Lattice`."""
+    """[bitmasks, groups, group_rows] uint32: the points seen so far, one a bit; see `Lattice`."""
     step: Array
     """int32: steps taken."""
 

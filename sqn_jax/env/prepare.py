@@ -160,15 +160,15 @@ def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> 
     Raises:
         ValueError: a level is negative or not finite.
     """
-    given = dataclasses.replace(
+    env_config = dataclasses.replace(
         params.config, velocity_noise=velocity_noise, range_noise=range_noise
     )
     compiled_in = dataclasses.replace(
-        given, velocity_noise=float(velocity_noise > 0), range_noise=float(range_noise > 0)
+        env_config, velocity_noise=float(velocity_noise > 0), range_noise=float(range_noise > 0)
     )
     return dataclasses.replace(
         params,
-        velocity_noise=_velocity_noise(given),
+        velocity_noise=_velocity_noise(env_config),
         range_noise=jnp.float32(range_noise),
         config=compiled_in,
     )
@@ -217,12 +217,12 @@ def _nearest(points: NDArray[np.float64], groups: NDArray[np.int64]) -> NDArray[
     Fewer, where a group has no more points.
     """
     count = min(NUM_NEIGHBORS, groups[:, 1].min() - 1)
-    found = np.empty((len(points), count), np.int64)
+    neighbors = np.empty((len(points), count), np.int64)
     for index, (point, (first, size)) in enumerate(zip(points, groups, strict=True)):
         distances = np.hypot(*(points[first : first + size] - point).T)
         distances[index - first] = np.inf
-        found[index] = first + np.argsort(distances, kind="stable")[:count]
-    return found
+        neighbors[index] = first + np.argsort(distances, kind="stable")[:count]
+    return neighbors
 
 
 def _spawn_positions(
@@ -230,8 +230,8 @@ def _spawn_positions(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Places around each point, [S, M, 2] m and how many are real, [S].
 
-    Places are centres of traversable cells within the spawn radius that lie in the connected
-    component of the point's own cell; at evaluation points only the point itself, or the centre
+    Places are centers of traversable cells within the spawn radius that lie in the connected
+    component of the point's own cell; at evaluation points only the point itself, or the center
     of its cell where single precision on the device would put it across a border into an obstacle.
     """
     resolution = occupancy_map.resolution
@@ -240,17 +240,17 @@ def _spawn_positions(
         marked = occupancy_map.evaluation_points
         on_device = marked.astype(np.float32) / np.float32(resolution)
         columns, rows = np.floor(on_device).astype(int).T
-        own_centres = cells_to_points(points_to_cells(marked, resolution), resolution)
+        own_centers = cells_to_points(points_to_cells(marked, resolution), resolution)
         free = body_free[rows, columns]
-        return np.where(free[:, None], marked, own_centres)[:, None], np.ones(len(marked), np.int64)
+        return np.where(free[:, None], marked, own_centers)[:, None], np.ones(len(marked), np.int64)
     groups = []
     reach = math.ceil(occupancy_map.spawn_radius / resolution)
     for point in occupancy_map.spawn_points:
         row, column = points_to_cells(point, resolution)
         corner = np.maximum([row - reach, column - reach], 0)
         around = labels[corner[0] : row + reach + 1, corner[1] : column + reach + 1]
-        centres = cells_to_points(np.argwhere(around == labels[row, column]) + corner, resolution)
-        group = centres[np.hypot(*(centres - point).T) <= occupancy_map.spawn_radius]
+        centers = cells_to_points(np.argwhere(around == labels[row, column]) + corner, resolution)
+        group = centers[np.hypot(*(centers - point).T) <= occupancy_map.spawn_radius]
         own_cell = cells_to_points([row, column], resolution)[None]
         groups.append(group if len(group) else own_cell)
     counts = np.array([len(group) for group in groups])

@@ -1,4 +1,4 @@
-"""Domain randomisation: a world of its own for each of N robots (future work, section VII)."""
+"""Domain randomization: a world of its own for each of N robots (future work, section VII)."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) ->
     Returns:
         Parameters in which each field that differs has a leading axis [N]; see `robot_axes`.
     """
-    shares = _spread(num_envs)
-    given = params.config
+    fractions = _spread(num_envs)
+    env_config = params.config
     changes: dict[str, Any] = {}
     if config.velocity_noise > 0:
-        speed = np.array([given.forward_speed, given.turn_rate])
-        unit = speed if given.velocity_noise_unit == "relative" else np.ones(2)
+        speed = np.array([env_config.forward_speed, env_config.turn_rate])
+        unit = speed if env_config.velocity_noise_unit == "relative" else np.ones(2)
         changes["velocity_noise"] = jnp.asarray(
-            config.velocity_noise * shares[:, :1] * unit, jnp.float32
+            config.velocity_noise * fractions[:, :1] * unit, jnp.float32
         )
-        given = dataclasses.replace(given, velocity_noise=config.velocity_noise)
+        env_config = dataclasses.replace(env_config, velocity_noise=config.velocity_noise)
     if config.range_noise > 0:
-        changes["range_noise"] = jnp.asarray(config.range_noise * shares[:, 1], jnp.float32)
-        given = dataclasses.replace(given, range_noise=config.range_noise)
+        changes["range_noise"] = jnp.asarray(config.range_noise * fractions[:, 1], jnp.float32)
+        env_config = dataclasses.replace(env_config, range_noise=config.range_noise)
     if config.speed > 0:
-        factors = jnp.asarray(1 + config.speed * (2 * shares[:, 2] - 1), jnp.float32)
+        factors = jnp.asarray(1 + config.speed * (2 * fractions[:, 2] - 1), jnp.float32)
         changes["commands"] = factors[:, None, None] * params.commands[None]
     if config.mirror:
         mirrored = _odd_ones(num_envs)
@@ -50,7 +50,7 @@ def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) ->
         commands = changes.get("commands", params.commands[None])
         changes["commands"] = commands * turns[:, None].astype(jnp.float32)
         changes["mirrored"] = jnp.asarray(mirrored)
-    return dataclasses.replace(params, config=given, **changes)
+    return dataclasses.replace(params, config=env_config, **changes)
 
 
 def robots_own(params: EnvParams) -> list[str]:

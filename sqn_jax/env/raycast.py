@@ -92,9 +92,9 @@ def _hop(
 ) -> Array:
     """Cast rays of the given angles, cosines and sines, [R] each."""
     angles, cosines, sines = directions
-    # The sector says which way the table looks: a direction that rounding has put on the other
-    # side of an axis comes back, and one on an axis gets a little aside, where 0 times infinity
-    # would appear.
+    # The sector says where the table looks: a direction that rounding has put on the other side of
+    # an axis comes back, and one on an axis moves a little aside, where 0 times infinity would
+    # appear.
     sector = jnp.floor(fraction(angles * (1 / (2 * np.pi))) * grid.sectors)
     sector = jnp.where(sector < grid.sectors, sector, 0.0)
     quarter = grid.sectors // 4
@@ -102,7 +102,7 @@ def _hop(
     sines = _with_sign(sines, sector < 2 * quarter)
     inverse_cosines, inverse_sines = 1 / cosines, 1 / sines
     # Counted from the corner of the robot's own cell: far from the map's corner, single precision
-    # would not tell the two sides of a border apart.
+    # would not distinguish the two sides of a border.
     in_cells = position / grid.resolution
     own_cell = jnp.floor(in_cells)
     x, y = in_cells - own_cell
@@ -110,16 +110,16 @@ def _hop(
     table_start = to_integer(sector) + (row * grid.width + column) * grid.sectors
     limit = max_range / grid.resolution
 
-    def hop(_: Array | int, travelled: Array) -> Array:
+    def hop(_: Array | int, traveled: Array) -> Array:
         # A thousandth of a cell beyond the last border, so that rounding cannot fall back.
-        inside = travelled + 1e-3
+        inside = traveled + 1e-3
         column, row = jnp.floor(x + cosines * inside), jnp.floor(y + sines * inside)
         place = table_start + to_integer(row * grid.width + column) * grid.sectors
         sides = _look_up(grid, place).astype(jnp.int32)
         side_x, side_y = (sides << 24) >> 24, sides >> 8
         to_side = (column + side_x.astype(jnp.float32) - x) * inverse_cosines
         to_top = (row + side_y.astype(jnp.float32) - y) * inverse_sines
-        return larger(travelled, smaller(smaller(to_side, to_top), limit))
+        return larger(traveled, smaller(smaller(to_side, to_top), limit))
 
     start = jnp.zeros_like(cosines)
     return repeat(iterations, hop, start, unroll=unroll) * grid.resolution

@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in a panel; more would hide each other
 
-# From skill 2, orange, over violet to skill 1, dark blue, as in all pictures. It gets steadily darker,
-# so that it can be read in grayscale.
+# From skill 2, orange, over violet to skill 1, dark blue, as in all pictures; steadily darker, so
+# that it can be read in grayscale.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 

@@ -21,50 +21,50 @@ def side_by_side(
     """Lay maps out in tiles as large as the largest, nearly square, row by row from below.
 
     Args:
-      maps: at least one; cells of one size. What they leave of a tile is occupied.
-      name: of the whole.
-      weights: how many times as many tasks each has in training, >= 1; 1 by default.
+        maps: at least one; cells of one size. What they leave of a tile is occupied.
+        name: of the whole.
+        weights: how many times as many tasks each map has in training, >= 1; 1 by default.
 
     Returns:
-      One map with `tiles` and `parts`, one a map in their order, and the points of all. Episodes
-      take as long as the longest one's.
+        One map with `tiles` and `parts`, one a map in their order, and the points of all. Episodes
+        take as long as the longest one's.
 
     Raises:
-      ValueError: no map, or cells of different sizes.
+        ValueError: no map, or cells of different sizes.
     """
     if not maps:
         raise ValueError(f"map {name}: no map to lay out, expected at least one")
     resolution = maps[0].resolution
-    for each in maps:
-        if each.resolution != resolution:
+    for occupancy_map in maps:
+        if occupancy_map.resolution != resolution:
             raise ValueError(
-                f"map {name}: {maps[0].name} has cells of {resolution:g} m and {each.name} "
-                f"of {each.resolution:g} m, expected one size"
+                f"map {name}: {maps[0].name} has cells of {resolution:g} m and "
+                f"{occupancy_map.name} of {occupancy_map.resolution:g} m, expected one size"
             )
     if len(maps) == 1:
         return dataclasses.replace(maps[0], name=name)
-    height, width = (max(each.shape[axis] for each in maps) for axis in (0, 1))
-    places, count = _places([each.shape for each in maps], (height, width))
+    height, width = (max(occupancy_map.shape[axis] for occupancy_map in maps) for axis in (0, 1))
+    places, count = _places([occupancy_map.shape for occupancy_map in maps], (height, width))
     columns, rows = _layout(count)
     occupied = np.ones((rows * height, columns * width), dtype=bool)
     spawn, evaluation, parts = [], [], []
-    for each, (tile, row, column) in zip(maps, places, strict=True):
+    for occupancy_map, (tile, row, column) in zip(maps, places, strict=True):
         top, left = tile // columns * height + row, tile % columns * width + column
-        own = close_border(each.occupied)
+        own = close_border(occupancy_map.occupied)
         occupied[top : top + own.shape[0], left : left + own.shape[1]] = own
         corner = np.array([left, top]) * resolution
-        spawn.append(each.spawn_points + corner)
-        evaluation.append(each.evaluation_points + corner)
-        parts.append((*corner.tolist(), *(corner + each.size_m).tolist()))
+        spawn.append(occupancy_map.spawn_points + corner)
+        evaluation.append(occupancy_map.evaluation_points + corner)
+        parts.append((*corner.tolist(), *(corner + occupancy_map.size_m).tolist()))
     return OccupancyMap(
         name=name,
         occupied=occupied,
         resolution=resolution,
         spawn_points=np.concatenate(spawn),
         evaluation_points=np.concatenate(evaluation),
-        spawn_radius=max(each.spawn_radius for each in maps),
-        max_steps=max(each.max_steps for each in maps),
-        warnings=tuple(line for each in maps for line in each.warnings),
+        spawn_radius=max(occupancy_map.spawn_radius for occupancy_map in maps),
+        max_steps=max(occupancy_map.max_steps for occupancy_map in maps),
+        warnings=tuple(line for occupancy_map in maps for line in occupancy_map.warnings),
         tiles=(columns, rows),
         parts=tuple(parts),
         weights=tuple(weights or [1] * len(maps)),

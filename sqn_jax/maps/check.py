@@ -40,9 +40,9 @@ def describe(
     """A readable report of several lines: size, free space, points, distances, warnings.
 
     Args:
-      occupancy_map: a map that `validate` accepts.
-      robot_radius: m; free space and distances are those of a robot of this size.
-      step_length: m driven in one step, to judge `max_steps`.
+        occupancy_map: a map that `validate` accepts.
+        robot_radius: m; free space and distances are those of a robot of this size.
+        step_length: m moved in one step, to judge `max_steps`.
     """
     rows, cols = occupancy_map.shape
     width, height = occupancy_map.size_m
@@ -66,20 +66,20 @@ def describe(
     ]
     geodesic, straight = evaluation_distances(occupancy_map, robot_radius)
     lines += _pair_lines(occupancy_map, geodesic, straight)
-    found = occupancy_map.warnings + _step_warnings(occupancy_map, geodesic, step_length)
-    lines += [f"warning        {line}" for line in found] or ["warnings       none"]
+    warnings = occupancy_map.warnings + _step_warnings(occupancy_map, geodesic, step_length)
+    lines += [f"warning        {line}" for line in warnings] or ["warnings       none"]
     return "\n".join(lines)
 
 
 def _step_warnings(
     occupancy_map: OccupancyMap, geodesic: NDArray[np.float64], step_length: float
 ) -> tuple[str, ...]:
-    """A line if an episode is too short for the longest way between two evaluation points."""
+    """A line if an episode is too short for the longest path between two evaluation points."""
     steps = math.ceil(geodesic.max() / step_length)
     if steps <= occupancy_map.max_steps:
         return ()
     return (
-        f"max_steps is {occupancy_map.max_steps}, but the longest way between evaluation points "
+        f"max_steps is {occupancy_map.max_steps}, but the longest path between evaluation points "
         f"takes at least {steps} steps of {step_length:g} m",
     )
 
@@ -87,7 +87,7 @@ def _step_warnings(
 def _pair_lines(
     occupancy_map: OccupancyMap, geodesic: NDArray[np.float64], straight: NDArray[np.float64]
 ) -> list[str]:
-    """The evaluation points in the map frame, and a table of the ways between them."""
+    """The evaluation points in the map frame, and a table of the paths between them."""
     if len(occupancy_map.evaluation_points) > _SHOWN_POINTS:
         return [f"               (more than {_SHOWN_POINTS}: distances not listed)"]
     points = occupancy_map.to_map_frame(occupancy_map.evaluation_points)

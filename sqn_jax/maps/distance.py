@@ -1,6 +1,6 @@
-"""Distance fields over an occupancy grid: to the nearest obstacle, and along the way to a goal.
+"""Distance fields over an occupancy grid: to the nearest obstacle, and along the path to a goal.
 
-Arrays are `[row, col]` with row 0 at the bottom; the centre of a cell is
+Arrays are `[row, col]` with row 0 at the bottom; the center of a cell is
 `((col + 0.5) * resolution, (row + 0.5) * resolution)` in the grid frame.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-# Half of the 32-neighbour moves (d_row, d_col); the other half are their reverses.
+# Half of the 32-neighbor moves (d_row, d_col); the other half are their reverses.
 _HALF_MOVES = (
     *((0, 1), (1, 0), (1, 1), (1, -1)),
     *((1, 2), (2, 1), (1, -2), (2, -1)),
@@ -28,18 +28,18 @@ FIELD_CELLS = 8_000_000
 
 
 def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Distance, in cells, from each cell centre to the nearest occupied cell's closed square.
+    """Distance, in cells, from each cell center to the nearest occupied cell's closed square.
 
-    Exact to float64 rounding. On a lattice of half cells the centres are the odd points and a
-    square is three by three points; the point of a square nearest to a centre is always one of
+    Exact to float64 rounding. On a lattice of half cells the centers are the odd points and a
+    square is three by three points; the point of a square nearest to a center is always one of
     them, so a Euclidean distance transform of that lattice gives the distance to the squares
-    themselves (the nearest *centre* need not belong to the nearest square).
+    themselves (the nearest *center* need not belong to the nearest square).
 
     Args:
-      occupied: bool [H, W].
+        occupied: bool [H, W].
 
     Returns:
-      float64 [H, W], 0 inside occupied cells, inf everywhere if no cell is occupied.
+        float64 [H, W], 0 inside occupied cells, inf everywhere if no cell is occupied.
     """
     rows, cols = occupied.shape
     if not occupied.any():
@@ -54,18 +54,18 @@ def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def is_clear(occupied: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    """Cells that are free and whose centre is at least so far from every occupied square.
+    """Cells that are free and whose center is at least so far from every occupied square.
 
     What `clearance_cells(occupied) >= radius` says, without the distances themselves: much faster
     for the few cells of a robot's radius. A square of an occupied cell (i, j) cells away is
-    hypot(max(i - 1/2, 0), max(j - 1/2, 0)) from the centre.
+    hypot(max(i - 1/2, 0), max(j - 1/2, 0)) from the center.
 
     Args:
-      occupied: bool [H, W].
-      radius: cells; what is negative counts as 0.
+        occupied: bool [H, W].
+        radius: cells; what is negative counts as 0.
 
     Returns:
-      bool [H, W].
+        bool [H, W].
     """
     rows = len(occupied)
     clear = ~occupied
@@ -87,16 +87,16 @@ def _widened(occupied: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
 
 
 def obstacle_distance(occupied: NDArray[np.bool_], resolution: float) -> NDArray[np.float32]:
-    """Distance from each cell centre to the nearest occupied cell's square.
+    """Distance from each cell center to the nearest occupied cell's square.
 
-    Exact (point to square, not centre to centre) to float32 rounding; see `clearance_cells`.
+    Exact (point to square, not center to center) to float32 rounding; see `clearance_cells`.
 
     Args:
-      occupied: bool [H, W].
-      resolution: m per cell, > 0.
+        occupied: bool [H, W].
+        resolution: m per cell, > 0.
 
     Returns:
-      float32 [H, W] in m, 0 inside occupied cells, inf everywhere if no cell is occupied.
+        float32 [H, W] in m, 0 inside occupied cells, inf everywhere if no cell is occupied.
     """
     return (clearance_cells(occupied) * resolution).astype(np.float32)
 
@@ -104,8 +104,8 @@ def obstacle_distance(occupied: NDArray[np.bool_], resolution: float) -> NDArray
 def segment_cells(d_row: int, d_col: int) -> list[tuple[int, int]]:
     """Offsets of all cells whose closed square meets the segment from (0, 0) to (d_row, d_col).
 
-    The segment joins two cell centres. A cell touched at a corner only is included, so a segment
-    that is free by this list never slips between two diagonal neighbours.
+    The segment joins two cell centers. A cell touched at a corner only is included, so a segment
+    that is free by this list never slips between two diagonal neighbors.
     """
     row_sign, col_sign = (1 if d_row >= 0 else -1), (1 if d_col >= 0 else -1)
     rows, cols = abs(d_row), abs(d_col)
@@ -122,11 +122,11 @@ def clear_moves(free: NDArray[np.bool_], d_row: int, d_col: int) -> NDArray[np.b
     """Cells from which the straight move by (d_row, d_col) passes over free cells only.
 
     Args:
-      free: bool [H, W]; cells outside the array count as not free.
-      d_row, d_col: the move, in cells.
+        free: bool [H, W]; cells outside the array count as not free.
+        d_row, d_col: the move, in cells.
 
     Returns:
-      bool [H, W], indexed by the cell where the move starts.
+        bool [H, W], indexed by the cell where the move starts.
     """
     rows, cols = free.shape
     margin = max(abs(d_row), abs(d_col))
@@ -174,31 +174,31 @@ def _goal_edges(
     rows, cols = np.nonzero(_seen_around(free, row, col))
     rows, cols = rows + row - _NEAR_CELLS, cols + col - _NEAR_CELLS
     away = np.hypot(cols + 0.5 - in_cells[0], rows + 0.5 - in_cells[1])
-    # A sparse matrix may drop an explicit zero; a goal on a cell centre still needs its edge.
+    # A sparse matrix may drop an explicit zero; a goal on a cell center still needs its edge.
     return rows, cols, np.maximum(away, 1e-12)
 
 
 def goal_distance(
     free: NDArray[np.bool_], resolution: float, goal_xy: ArrayLike
 ) -> NDArray[np.float32]:
-    """Length of the shortest way over free cells from each cell centre to a goal.
+    """Length of the shortest path over free cells from each cell center to a goal.
 
-    Dijkstra on the 32-neighbour grid (steps such as 3 across and 2 up; no step touches a cell that
+    Dijkstra on the 32-neighbor grid (steps such as 3 across and 2 up; no step touches a cell that
     is not free, not even at a corner). Never shorter than the straight line; in empty space at most
-    1.3 % longer, since the steps know 32 directions only. In tight clutter, where a slanting way
-    has no room to be imitated, a single way came out up to 9 % longer than the shortest chain of
-    sight lines between cell centres, all ways together less than 3 %.
+    1.3 % longer, since the steps know 32 directions only. In tight clutter, where a slanting path
+    has no room to be imitated, a single path came out up to 9 % longer than the shortest chain of
+    sight lines between cell centers, all paths together less than 3 %.
 
     Args:
-      free: bool [H, W], the cells that may be crossed (see `occupancy.traversable`).
-      resolution: m per cell, > 0.
-      goal_xy: [..., 2] goal (x, y) in the grid frame, m; several goals share one graph.
+        free: bool [H, W], the cells that may be crossed (see `occupancy.traversable`).
+        resolution: m per cell, > 0.
+        goal_xy: [..., 2] goal (x, y) in the grid frame, m; several goals share one graph.
 
     Returns:
-      float32 [..., H, W] in m, inf where the goal cannot be reached and in cells that are not free.
+        float32 [..., H, W] in m, inf where there is no path and in cells that are not free.
 
     Raises:
-      ValueError: a goal lies outside the map or in a cell that is not free.
+        ValueError: a goal lies outside the map or in a cell that is not free.
     """
     goals = np.asarray(goal_xy, dtype=np.float64)
     flat_goals = goals.reshape(-1, 2)
@@ -216,10 +216,10 @@ def goal_distance(
     graph = sparse.csr_matrix(
         (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(nodes, nodes)
     )
-    # The goals' own edges lead outwards only, so no way can use a goal as a shortcut.
-    found = csgraph.dijkstra(graph, directed=True, indices=np.arange(count, nodes))
+    # The goals' own edges lead outward only, so no path can use a goal as a shortcut.
+    lengths = csgraph.dijkstra(graph, directed=True, indices=np.arange(count, nodes))
     distance = np.full((len(flat_goals), *free.shape), np.inf, dtype=np.float32)
-    distance[:, free] = found[:, :count] * resolution
+    distance[:, free] = lengths[:, :count] * resolution
     return distance.reshape(*goals.shape[:-1], *free.shape)
 
 
@@ -229,11 +229,11 @@ def goal_fields(
     """The distance field of each different goal, a few computed at a time to bound the memory.
 
     Args:
-      free, resolution: as for `goal_distance`.
-      goals: [E, 2] in the grid frame, m; the same one may come many times.
+        free, resolution: as for `goal_distance`.
+        goals: [E, 2] in the grid frame, m; the same one may come many times.
 
     Yields:
-      Which of the goals [n] are this one, and its `goal_distance` [H, W].
+        Which of the goals [n] are this one, and its `goal_distance` [H, W].
     """
     places, which = np.unique(goals, axis=0, return_inverse=True)
     which = which.reshape(-1)

@@ -20,12 +20,12 @@ def read_at_most(path: Path, limit: int, expected: str) -> bytes:
     """The contents of a regular file of at most `limit` bytes; a larger one is not read.
 
     Args:
-      path: the file.
-      limit: bytes.
-      expected: what the file should have been, for the errors.
+        path: the file.
+        limit: bytes.
+        expected: what the file should have been, for the errors.
 
     Raises:
-      ValueError: one line naming the file: there is none, it cannot be read, or it is larger.
+        ValueError: one line naming the file: there is none, it cannot be read, or it is larger.
     """
     try:
         if not path.is_file():

@@ -39,12 +39,12 @@ from sqn_jax.maps.terrain import (
 _GAP = 0.7  # m, at least, between two obstacles in the open
 _TRIES = 400  # places tried for obstacles in the open
 _MAZE_SIDE = 8  # cells of the plan
-_MAZE_LOOPS = 5  # walls taken out of a maze that has one way only
+_MAZE_LOOPS = 5  # walls taken out of a maze that has only one path
 _CAVE_SIDE = 6  # places a side where tunnels may meet
 _CAVE_LOOPS = 3
 _CAVE_LEFT_OUT = 8  # places of the cave that stay rock
 _CAVE_MARGIN = 4.0  # m; no nearer to the border lies the course of a tunnel
-_CAVE_WAY = 115.0  # m, about the longest way from start to goal
+_CAVE_PATH = 115.0  # m, about the longest path from start to goal
 
 Edge = tuple[int, int]
 
@@ -53,16 +53,17 @@ def generate(kind: str, seed: int) -> OccupancyMap:
     """The map of a kind that belongs to a seed.
 
     Args:
-      kind: "maze" (17 x 17 m, corridors about 2 m wide), "column" (17 x 17 m, round pillars around
-        an open middle), "forest" (17 x 17 m, asterisks) or "cave" (51 x 51 m, rough tunnels).
-      seed: any whole number >= 0.
+        kind: "maze" (17 x 17 m, corridors about 2 m wide), "column" (17 x 17 m, round pillars
+            around an open middle), "forest" (17 x 17 m, asterisks) or "cave" (51 x 51 m, rough
+            tunnels).
+        seed: any whole number >= 0.
 
     Returns:
-      The map, named kind-seed: 0.05 m a cell, spawn points all over, four evaluation points in a
-      maze and two (start, goal) in the others, 400 steps an episode, 1200 in a cave.
+        The map, named kind-seed: 0.05 m a cell, spawn points all over, four evaluation points in a
+        maze and two (start, goal) in the others, 400 steps an episode, 1200 in a cave.
 
     Raises:
-      ValueError: an unknown kind, or a seed that is not a whole number >= 0.
+        ValueError: an unknown kind, or a seed that is not a whole number >= 0.
 
     Example:
         >>> generate("column", 3).size_m
@@ -88,7 +89,7 @@ def generate(kind: str, seed: int) -> OccupancyMap:
 def _grow_tree(side: int, rng: np.random.Generator) -> set[Edge]:
     """A random tree over a square of side x side places: edges (a, b), a < b, row * side + col.
 
-    Grown from the place reached last (long ways) or from any reached so far (short dead ends).
+    Grown from the place reached last (long paths) or from any reached so far (short dead ends).
     """
     edges: set[Edge] = set()
     active = [int(rng.integers(side * side))]
@@ -117,7 +118,7 @@ def _beside(place: int, side: int) -> list[int]:
 def _add_loops(
     edges: set[Edge], places: set[int], side: int, count: int, rng: np.random.Generator
 ) -> set[Edge]:
-    """The edges and `count` more (or all there are) between neighbours among the places."""
+    """The edges and `count` more (or all there are) between neighbors among the places."""
     absent = [
         (place, other)
         for place in sorted(places)
@@ -128,13 +129,13 @@ def _add_loops(
     return edges | {absent[index] for index in order[:count]}
 
 
-def _ways(edges: set[Edge], lengths: dict[Edge, float], count: int) -> NDArray[np.float64]:
-    """Length of the shortest way [count, count] between all places; inf where there is none."""
+def _path_lengths(edges: set[Edge], lengths: dict[Edge, float], count: int) -> NDArray[np.float64]:
+    """Length of the shortest path [count, count] between all places; inf where there is none."""
     pairs = np.array(sorted(edges))
     data = np.array([lengths[edge] for edge in sorted(edges)])
     graph = coo_array((data, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    found: NDArray[np.float64] = dijkstra(graph.tocsr(), directed=False)
-    return found
+    path_lengths: NDArray[np.float64] = dijkstra(graph.tocsr(), directed=False)
+    return path_lengths
 
 
 def _maze(name: str, rng: np.random.Generator) -> OccupancyMap:
@@ -152,7 +153,7 @@ def _maze(name: str, rng: np.random.Generator) -> OccupancyMap:
         (row, col), (other_row, other_col) = divmod(place, side), divmod(other, side)
         rows = slice(spans[row].start, spans[other_row].stop)
         occupied[rows, spans[col].start : spans[other_col].stop] = False
-    steps = _ways(edges, dict.fromkeys(edges, 1.0), count)
+    steps = _path_lengths(edges, dict.fromkeys(edges, 1.0), count)
     marked = [int(steps[0].argmax())]
     while len(marked) < 4:
         marked.append(int(steps[marked].min(axis=0).argmax()))
@@ -208,12 +209,12 @@ def _column(name: str, rng: np.random.Generator) -> OccupancyMap:
     keep_free[where] = cells
 
     def draw() -> Callable[[float], Window]:
-        centre = (_uniform(rng, 1, 16), _uniform(rng, 1, 16))
+        center = (_uniform(rng, 1, 16), _uniform(rng, 1, 16))
         radius = _uniform(rng, 0.25, 1.0)
-        return lambda margin: disc(SMALL_SIZE, centre, radius + margin)
+        return lambda margin: disc(SMALL_SIZE, center, radius + margin)
 
     _place_obstacles(occupied, keep_free, draw, 26)
-    return finish_map(name, occupied, [(1.5, 15.5), (15.5, 1.5)], spawn_count=40, room=0.6)
+    return finish_map(name, occupied, [(1.5, 15.5), (15.5, 1.5)], spawn_count=40, clearance=0.6)
 
 
 def _forest(name: str, rng: np.random.Generator) -> OccupancyMap:
@@ -222,17 +223,17 @@ def _forest(name: str, rng: np.random.Generator) -> OccupancyMap:
     keep_free = np.zeros_like(occupied)
 
     def draw() -> Callable[[float], Window]:
-        centre = (_uniform(rng, 1.2, 15.8), _uniform(rng, 1.2, 15.8))
+        center = (_uniform(rng, 1.2, 15.8), _uniform(rng, 1.2, 15.8))
         arms = 5 + int(rng.integers(3))
         turn = _uniform(rng, 0, 2 * math.pi)
         angles = [turn + 2 * math.pi * (k + _uniform(rng, -0.2, 0.2)) / arms for k in range(arms)]
         lengths = [_uniform(rng, 0.8, 1.9) for _ in range(arms)]
         half_width = _uniform(rng, 0.08, 0.14)
-        return lambda margin: asterisk(SMALL_SIZE, centre, angles, lengths, half_width + margin)
+        return lambda margin: asterisk(SMALL_SIZE, center, angles, lengths, half_width + margin)
 
     _place_obstacles(occupied, keep_free, draw, 20)
     occupied = round_crooks(occupied)
-    return finish_map(name, occupied, [(1.5, 1.5), (15.5, 15.5)], spawn_count=40, room=0.5)
+    return finish_map(name, occupied, [(1.5, 1.5), (15.5, 15.5)], spawn_count=40, clearance=0.5)
 
 
 def _cave(name: str, rng: np.random.Generator) -> OccupancyMap:
@@ -259,14 +260,14 @@ def _cave(name: str, rng: np.random.Generator) -> OccupancyMap:
         paths.append(np.array([ends[0], *bends, ends[1]]))
         lengths[first, second] = float(np.hypot(*(nodes[second] - nodes[first])))
     start = min(places, key=lambda place: (nodes[place].sum(), place))
-    ways = _ways(edges, lengths, side * side)[start]
-    goal = int(np.where(ways <= _CAVE_WAY, ways, -1.0).argmax())
+    path_lengths = _path_lengths(edges, lengths, side * side)[start]
+    goal = int(np.where(path_lengths <= _CAVE_PATH, path_lengths, -1.0).argmax())
     return finish_map(
         name,
         carve_tunnels(CAVE_SIZE, paths, rng),
         [nodes[start], nodes[goal]],
         spawn_count=100,
-        room=0.7,
+        clearance=0.7,
         max_steps=1200,
     )
 

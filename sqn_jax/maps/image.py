@@ -1,4 +1,4 @@
-"""Map images: from the grey of a PNG or PGM file to occupied cells, as ROS map_server does it."""
+"""Map images: from the gray of a PNG or PGM file to occupied cells, as ROS map_server does it."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ MAX_IMAGE_BYTES = 512 * 2**20
 MODES = ("trinary", "scale", "raw")
 _TEXT_KINDS = (b"P1", b"P2", b"P3")
 # See `suspicious_level`.
-_UNKNOWN_GREY = 205  # of 255
+_UNKNOWN_GRAY = 205  # of 255
 _NEAR_THRESHOLD = 0.1
-_LARGE_SHARE = 0.2
-_UNKNOWN_SHARE = 0.01
+_LARGE_FRACTION = 0.2
+_UNKNOWN_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """How grey becomes occupancy: the keys of a map_server YAML file.
+    """How gray becomes occupancy: the keys of a map_server YAML file.
 
     Attributes:
-      mode: trinary, scale or raw.
-      negate: True if white is occupied.
-      occupied_thresh: occupancy above this is occupied, 0..1.
-      free_thresh: occupancy below this is free, 0..1; between the two it is unknown.
+        mode: trinary, scale or raw.
+        negate: True if white is occupied.
+        occupied_thresh: occupancy above this is occupied, 0..1.
+        free_thresh: occupancy below this is free, 0..1; between the two it is unknown.
     """
 
     mode: str = "trinary"
@@ -43,7 +43,7 @@ class Thresholds:
 
 
 @dataclass(frozen=True)
-class GreyImage:
+class GrayImage:
     """Decoded pixels: channel sums `level` [H, W] (row 0 at the top) of which `white` is white.
 
     `opaque` is bool [H, W], or None for an image without an alpha channel.
@@ -54,11 +54,11 @@ class GreyImage:
     opaque: NDArray[np.bool_] | None
 
 
-def read_pixels(path: Path, mode: str) -> GreyImage:
-    """Decode a PNG or PGM file; colour is averaged, alpha too in trinary mode (as map_server does).
+def read_pixels(path: Path, mode: str) -> GrayImage:
+    """Decode a PNG or PGM file; color is averaged, alpha too in trinary mode (as map_server does).
 
     Raises:
-      ValueError: one line, without the file's name: not an image, too large, damaged.
+        ValueError: one line, without the file's name: not an image, too large, damaged.
     """
     size = path.stat().st_size
     if not 1 <= size <= MAX_IMAGE_BYTES:
@@ -79,7 +79,7 @@ def read_pixels(path: Path, mode: str) -> GreyImage:
             if is_png:
                 _require_whole_png(data)
             with _opened(data) as image:
-                return _to_grey(image, mode)
+                return _to_gray(image, mode)
         except UnidentifiedImageError as error:
             raise ValueError("contents of another kind, expected a PNG or PGM image") from error
         # Pillow's decoders raise a dozen kinds of error on damaged files: each means unusable.
@@ -92,7 +92,7 @@ def _opened(data: bytes) -> Image.Image:
 
 
 def _require_whole_png(data: bytes) -> None:
-    """Refuse wrong checksums and missing rows; Pillow itself tells of the rest when it decodes."""
+    """Refuse wrong checksums and missing rows; Pillow reports the rest when it decodes."""
     # Rows that are missing stay what they were before decoding: they differ if that does.
     if _last_rows(data, 0) != _last_rows(data, 1):
         raise ValueError("rows of pixels are missing")
@@ -107,34 +107,34 @@ def _last_rows(data: bytes, before: int) -> bytes:
         return image.crop((0, max(0, image.height - 2), *image.size)).tobytes()
 
 
-def _to_grey(image: Image.Image, mode: str) -> GreyImage:
+def _to_gray(image: Image.Image, mode: str) -> GrayImage:
     """Pixels of an open image of any supported kind."""
-    # A palette's transparency is an alpha channel like any other; a single grey or colour marked as
+    # A palette's transparency is an alpha channel like any other; a single gray or color marked as
     # clear is none, but makes its pixels unknown where opacity counts.
     clear = image.info.get("transparency")
     if image.mode in ("I", "I;16", "I;16B", "I;16L"):
         # 16 bits: read as numbers, since a conversion to 8 bits would clip at 255.
-        grey = np.asarray(image).astype(np.int64).clip(0, 65535)
-        return GreyImage(grey, 65535, None if clear is None else grey != clear)
+        gray = np.asarray(image).astype(np.int64).clip(0, 65535)
+        return GrayImage(gray, 65535, None if clear is None else gray != clear)
     if image.mode in ("P", "RGB", "L", "1"):
         channels = "RGB" if image.mode in ("P", "RGB") else "L"
         has_alpha = clear is not None and (image.mode == "P" or mode == "scale")
         image = image.convert(channels + "A" if has_alpha else channels)
     if image.mode not in ("L", "LA", "RGB", "RGBA"):
-        raise ValueError(f"pixel type {image.mode!r}, expected grey, colour or palette")
+        raise ValueError(f"pixel type {image.mode!r}, expected gray, color or palette")
     pixels = np.asarray(image)
     if pixels.ndim == 2:
-        return GreyImage(pixels, 255, None)
+        return GrayImage(pixels, 255, None)
     if image.mode == "RGB":
-        return GreyImage(pixels.sum(axis=-1, dtype=np.int32), 3 * 255, None)
+        return GrayImage(pixels.sum(axis=-1, dtype=np.int32), 3 * 255, None)
     opaque = pixels[..., -1] == 255
     if mode != "trinary":
         pixels = pixels[..., :-1]
-    return GreyImage(pixels.sum(axis=-1, dtype=np.int32), 255 * pixels.shape[-1], opaque)
+    return GrayImage(pixels.sum(axis=-1, dtype=np.int32), 255 * pixels.shape[-1], opaque)
 
 
 def level_occupancy(white: int, thresholds: Thresholds) -> NDArray[np.float64]:
-    """Occupancy of every grey level 0..white: 0..1, or above 1 where a raw level means unknown."""
+    """Occupancy of every gray level 0..white: 0..1, or above 1 where a raw level means unknown."""
     levels = np.arange(white + 1)
     if thresholds.mode == "raw":
         # Raw images hold the percentage itself, whatever `negate` says; above 100 is unknown.
@@ -142,7 +142,7 @@ def level_occupancy(white: int, thresholds: Thresholds) -> NDArray[np.float64]:
     return (levels if thresholds.negate else white - levels) / white
 
 
-def occupied_cells(image: GreyImage, thresholds: Thresholds) -> NDArray[np.bool_]:
+def occupied_cells(image: GrayImage, thresholds: Thresholds) -> NDArray[np.bool_]:
     """Occupied cells [H, W] with row 0 at the BOTTOM: whatever is not free, unknown included.
 
     A pixel is free if its occupancy is below `free_thresh`; in scale mode it must be opaque too.
@@ -154,10 +154,10 @@ def occupied_cells(image: GreyImage, thresholds: Thresholds) -> NDArray[np.bool_
     return ~free[::-1]
 
 
-def suspicious_level(image: GreyImage, thresholds: Thresholds) -> str | None:
-    """One line about a grey level that probably means unknown and yet reads as free, else None.
+def suspicious_level(image: GrayImage, thresholds: Thresholds) -> str | None:
+    """One line about a gray level that probably means unknown and yet reads as free, else None.
 
-    Map files write unknown as grey 205, occupancy 0.196. A `free_thresh` above that makes all
+    Map files write unknown as gray 205, occupancy 0.196. A `free_thresh` above that makes all
     unexplored ground free. Suspicious is the largest level, other than the freest one present,
     whose occupancy is within 0.1 below `free_thresh`, if it fills more than a fifth of the free
     space; for 205 itself a hundredth is enough, since little else is ever written so.
@@ -172,11 +172,11 @@ def suspicious_level(image: GreyImage, thresholds: Thresholds) -> str | None:
         return None
     near &= occupancy > occupancy[free].min()
     level = int(np.argmax(np.where(near, pixels, 0)))
-    share = pixels[level] / pixels[free].sum()
-    is_unknown_grey = round(level * 255 / image.white) == _UNKNOWN_GREY
-    if not near[level] or share <= (_UNKNOWN_SHARE if is_unknown_grey else _LARGE_SHARE):
+    fraction = pixels[level] / pixels[free].sum()
+    is_unknown_gray = round(level * 255 / image.white) == _UNKNOWN_GRAY
+    if not near[level] or fraction <= (_UNKNOWN_FRACTION if is_unknown_gray else _LARGE_FRACTION):
         return None
     return (
-        f"grey {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {share:.0%} of "
+        f"gray {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {fraction:.0%} of "
         f"the free space: if it means unknown, lower free_thresh from {thresholds.free_thresh:g}"
     )

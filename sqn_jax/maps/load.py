@@ -21,27 +21,27 @@ def load_map(
     """Load and check a map, or several side by side.
 
     Args:
-      name: "maze" or another map of the project; a path ending in .yaml, .yml or (MovingAI, 1 m a
-        cell) .map; "maze:7", the procedural map of a kind and a seed; or several of these,
-        "maze,maze:0-14", each with a weight perhaps, "maze*8,maze:0-14". Text or what
-        `config.map_names.parse` makes of it; a `Path` is a file.
-      robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
-      allow_outside: see `load_map_file`.
+        name: "maze" or another map of the project; a path ending in .yaml, .yml or (MovingAI, 1 m a
+            cell) .map; "maze:7", the procedural map of a kind and a seed; or several of these,
+            "maze,maze:0-14", each with a weight perhaps, "maze*8,maze:0-14". Text or what
+            `config.map_names.parse` makes of it; a `Path` is a file.
+        robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
+        allow_outside: see `load_map_file`.
 
     Returns:
-      The map, points in the grid frame.
+        The map, points in the grid frame.
 
     Raises:
-      ValueError: one line naming the file, the field, the offending value and what was expected.
+        ValueError: one line naming the file, the field, the offending value and what was expected.
 
     Warns:
-      UserWarning: a large area whose grey looks like unknown reads as free.
+        UserWarning: a large area whose gray looks like unknown reads as free.
     """
     if isinstance(name, str | Path):
         name = parse(name)
     elif not isinstance(name, MapSet):
         name = MapSet((name,), (1,))
-    maps = [_load_one(each, robot_radius, allow_outside) for each in name.names]
+    maps = [_load_one(part, robot_radius, allow_outside) for part in name.names]
     if len(maps) == 1:
         return maps[0]
     joined = side_by_side(maps, str(name), name.weights)

@@ -26,13 +26,13 @@ def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -
     """Load a `.map` file; it names no scale and no points, so these are given and sampled.
 
     Args:
-      path: the file: `type octile`, `height H`, `width W`, `map`, then H lines of W letters, the
-        first one the north edge.
-      robot_radius: m.
-      resolution: m per cell.
+        path: the file: `type octile`, `height H`, `width W`, `map`, then H lines of W letters, the
+            first one the north edge.
+        robot_radius: m.
+        resolution: m per cell.
 
     Raises:
-      ValueError: one line naming the file, the field and what was expected.
+        ValueError: one line naming the file, the field and what was expected.
     """
     data = read_at_most(path, _MAX_BYTES, "a MovingAI map")
     # One byte a line end, whatever the file has, so that row r begins at r * (width + 1). The body
@@ -41,12 +41,12 @@ def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -
     *lines, body = [*data.split(b"\n", 4), b"", b"", b"", b""][:5]
     header = {}
     for number, line in enumerate(lines[:3]):
-        words = line.split(None, 2)
-        if len(words) != 2:
+        fields = line.split(None, 2)
+        if len(fields) != 2:
             raise ValueError(
                 f"{named(path)}: header: line {number + 1}: expected a key and a value"
             )
-        header[words[0]] = words[1]
+        header[fields[0]] = fields[1]
     if header.get(b"type") != b"octile" or lines[3].strip() != b"map":
         raise ValueError(f"{named(path)}: header: expected type octile, height, width, map")
     rows, cols = (_side(path, key, header) for key in ("height", "width"))

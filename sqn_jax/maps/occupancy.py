@@ -27,20 +27,20 @@ class OccupancyMap:
     """A map with the places where episodes start and end. Points are in the grid frame, in m.
 
     Attributes:
-      name: short name for tables and file names.
-      occupied: bool [H, W], row 0 at the bottom; unknown counts as occupied, the border is closed.
-      resolution: m per cell.
-      spawn_points: float64 [S, 2], where training starts and goals lie.
-      evaluation_points: float64 [E, 2], the starts and goals of the fixed evaluation.
-      origin: pose (x m, y m, yaw rad) of the grid's lower-left corner in the map frame.
-      spawn_radius: m; starts are drawn from free cells this near to a spawn point.
-      max_steps: length of an episode.
-      warnings: what the loader found odd, one line each.
-      tiles: (columns, rows) of tiles of equal size, if several maps lie side by side in this one
-        (`maps.atlas`); none of them crosses the border of a tile.
-      parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
-        points in the same part reach each other.
-      weights: for each part how many times as many training tasks as its points alone would give.
+        name: short name for tables and file names.
+        occupied: bool [H, W], row 0 at the bottom; unknown is occupied, the border is closed.
+        resolution: m per cell.
+        spawn_points: float64 [S, 2], where training starts and goals lie.
+        evaluation_points: float64 [E, 2], the starts and goals of the fixed evaluation.
+        origin: pose (x m, y m, yaw rad) of the grid's lower-left corner in the map frame.
+        spawn_radius: m; starts are drawn from free cells this near to a spawn point.
+        max_steps: length of an episode.
+        warnings: oddities that the loader noticed, one line each.
+        tiles: (columns, rows) of tiles of equal size, if several maps lie side by side in this one
+            (`maps.atlas`); none of them crosses the border of a tile.
+        parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
+            points in the same part reach each other.
+        weights: for each part how many times as many training tasks as its points alone would give.
     """
 
     name: str
@@ -83,7 +83,7 @@ class OccupancyMap:
         return part
 
     def identity(self) -> dict[str, Any]:
-        """What tells this map from another: its size, and a SHA-256 of all that decides a task."""
+        """What identifies this map: its size, and a SHA-256 of all that decides a task."""
         contents = hashlib.sha256(np.packbits(self.occupied).tobytes())
         for numbers in (self.spawn_points, self.evaluation_points, [self.spawn_radius]):
             contents.update(np.asarray(numbers, dtype="<f8").tobytes())
@@ -118,12 +118,12 @@ def points_to_cells(points: ArrayLike, resolution: float) -> NDArray[np.int64]:
 
 
 def cells_to_points(cells: ArrayLike, resolution: float) -> NDArray[np.float64]:
-    """Centres (x, y) [..., 2] in m of cells (row, col) [..., 2]."""
+    """Centers (x, y) [..., 2] in m of cells (row, col) [..., 2]."""
     return (np.asarray(cells)[..., ::-1] + 0.5) * resolution
 
 
 def close_border(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A copy with the outermost cells occupied, so that nothing drives or sees off the map."""
+    """A copy with the outermost cells occupied, so that nothing moves or sees off the map."""
     closed = np.ones_like(occupied)
     closed[1:-1, 1:-1] = occupied[1:-1, 1:-1]
     return closed
@@ -132,15 +132,15 @@ def close_border(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def traversable(
     occupied: NDArray[np.bool_], resolution: float, robot_radius: float
 ) -> NDArray[np.bool_]:
-    """Cells on whose centre a round robot fits: no occupied square nearer than its radius.
+    """Cells on whose center a round robot fits: no occupied square nearer than its radius.
 
     Args:
-      occupied: bool [H, W].
-      resolution: m per cell.
-      robot_radius: m, >= 0; 0 leaves every cell that is not occupied.
+        occupied: bool [H, W].
+        resolution: m per cell.
+        robot_radius: m, >= 0; 0 leaves every cell that is not occupied.
 
     Returns:
-      bool [H, W].
+        bool [H, W].
     """
     # A millionth of a cell of slack: 0.15 / 0.05 is not exactly 3.
     return is_clear(occupied, robot_radius / resolution - 1e-6)
@@ -171,10 +171,10 @@ def sample_spawn_points(
     and rooms, i.e. local maxima of the obstacle distance, of the largest connected component.
 
     Returns:
-      float64 [<= count, 2] grid-frame (x, y) in m; fewer points only if there are fewer cells.
+        float64 [<= count, 2] grid-frame (x, y) in m; fewer points only if there are fewer cells.
 
     Raises:
-      ValueError: no free space for the robot.
+        ValueError: no free space for the robot.
     """
     clearance = clearance_cells(occupied)
     component = largest_component(traversable(occupied, resolution, robot_radius))
@@ -211,12 +211,12 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
     """Check that episodes can run on a map: room, points on free ground, all mutually reachable.
 
     Args:
-      occupancy_map: the map.
-      robot_radius: m, >= 0.
-      source: what errors call the map; its name if None.
+        occupancy_map: the map.
+        robot_radius: m, >= 0.
+        source: what errors call the map; its name if None.
 
     Raises:
-      ValueError: one line naming the map, the point (in the map frame, as in its file) and why.
+        ValueError: one line naming the map, the point (in the map frame, as in its file) and why.
     """
     source = source or f"map {occupancy_map.name!r}"
     for field in ("spawn_points", "evaluation_points"):
@@ -228,7 +228,7 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
         raise ValueError(f"{source}: no free space for a robot of radius {robot_radius:g} m")
     labels, _ = connected_components(free)
     rows, cols = occupancy_map.shape
-    found: list[tuple[str, int, int]] = []
+    labeled_points: list[tuple[str, int, int]] = []
     for name, point in _named_points(occupancy_map):
         # What overflows lies outside.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -246,17 +246,19 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
             raise ValueError(
                 f"{where} is too near an obstacle, expected {robot_radius:g} m (the robot's radius)"
             )
-        found.append((name, int(labels[row, col]), int(occupancy_map.part_of(point))))
-    for part in sorted({part for _, _, part in found}):
-        _require_connected([each[:2] for each in found if each[2] == part], source)
+        labeled_points.append((name, int(labels[row, col]), int(occupancy_map.part_of(point))))
+    for part in sorted({part for _, _, part in labeled_points}):
+        _require_connected(
+            [labeled[:2] for labeled in labeled_points if labeled[2] == part], source
+        )
 
 
-def _require_connected(found: list[tuple[str, int]], source: str) -> None:
+def _require_connected(labeled_points: list[tuple[str, int]], source: str) -> None:
     """Check that points, given by name and component, are all in one component."""
     # The component that holds most points is the one meant; the odd one out is reported.
-    main = int(np.bincount([label for _, label in found]).argmax())
-    reference = next(name for name, label in found if label == main)
-    for name, label in found:
+    main = int(np.bincount([label for _, label in labeled_points]).argmax())
+    reference = next(name for name, label in labeled_points if label == main)
+    for name, label in labeled_points:
         if label != main:
             raise ValueError(
                 f"{source}: {name} cannot be reached from {reference}, "

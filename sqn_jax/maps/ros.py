@@ -24,7 +24,7 @@ from PIL import Image
 from sqn_jax.maps.files import named, one_line, read_at_most
 from sqn_jax.maps.image import (
     MODES,
-    GreyImage,
+    GrayImage,
     Thresholds,
     occupied_cells,
     read_pixels,
@@ -44,23 +44,23 @@ MAX_YAML_BYTES = 2**20
 MAX_POINTS = 10_000
 MIN_RESOLUTION, MAX_RESOLUTION = 1e-6, 1000.0  # m per cell
 MAX_PLACE = 1e9
-"""m or rad; up to here float64 knows a point to about a tenth of a micrometre."""
+"""m or rad; up to here float64 knows a point to about a tenth of a micrometer."""
 _INSIDE = (
     "a file in the YAML file's folder: copy the image beside the YAML file and write just its name "
     "here, or allow images outside where that is offered (sqn map check --allow-outside, "
     "load_map(..., allow_outside=True))"
 )
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
-_FREE_GREY, _OCCUPIED_GREY = 254, 0
+_FREE_GRAY, _OCCUPIED_GRAY = 254, 0
 
 
 def known_maps() -> dict[str, Path]:
     """The project's own maps, name -> YAML file: in the wheel, or in a checkout's maps folder."""
     here = Path(__file__).resolve()
     for folder in (here.parent / "data", here.parents[2] / "maps"):
-        found = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-        if found:
-            return found
+        yaml_files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+        if yaml_files:
+            return yaml_files
     return {}
 
 
@@ -77,20 +77,19 @@ def load_map_file(
     apart, as evaluation points.
 
     Args:
-      name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI, 1 m a cell) .map.
-      robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
-      allow_outside: let a YAML file name an image that lies outside its own folder, by a path that
-        leads out of it or by a link. Whatever it names must still be a PNG or PNM file of the usual
-        size.
+        name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI, 1 m a cell) .map.
+        robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
+        allow_outside: let a YAML file name an image outside its own folder, by a path that leads
+            out of it or by a link. It must still be a PNG or PNM file of the usual size.
 
     Returns:
-      The map, points in the grid frame.
+        The map, points in the grid frame.
 
     Raises:
-      ValueError: one line naming the file, the field, the offending value and what was expected.
+        ValueError: one line naming the file, the field, the offending value and what was expected.
 
     Warns:
-      UserWarning: a large area whose grey looks like unknown reads as free.
+        UserWarning: a large area whose gray looks like unknown reads as free.
     """
     if not (math.isfinite(robot_radius) and robot_radius >= 0):
         raise ValueError(f"robot_radius: {robot_radius!r}, expected a length >= 0 in m")
@@ -160,14 +159,14 @@ def save_map(occupancy_map: OccupancyMap, yaml_path: str | Path) -> None:
     else to rounding (they are stored in the map frame).
 
     Raises:
-      ValueError: the files cannot be written, or the path does not end in .yaml.
+        ValueError: the files cannot be written, or the path does not end in .yaml.
     """
     path = Path(yaml_path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{named(path)}: expected a path ending in .yaml")
-    grey = np.where(occupancy_map.occupied[::-1], _OCCUPIED_GREY, _FREE_GREY).astype(np.uint8)
+    gray = np.where(occupancy_map.occupied[::-1], _OCCUPIED_GRAY, _FREE_GRAY).astype(np.uint8)
     png = io.BytesIO()
-    Image.fromarray(grey).save(png, format="PNG", optimize=True)
+    Image.fromarray(gray).save(png, format="PNG", optimize=True)
     text = _yaml_text(occupancy_map, path.with_suffix(".png").name)
     try:
         path.with_suffix(".png").write_bytes(png.getvalue())
@@ -261,7 +260,7 @@ def _numbers(path: Path, field: str, value: object, count: int, form: str) -> li
 
 
 def _thresholds(path: Path, fields: Mapping[str, Any]) -> Thresholds:
-    """The keys that say how grey becomes occupancy."""
+    """The keys that say how gray becomes occupancy."""
     mode = fields.get("mode", "trinary")
     if mode not in MODES:
         _fail(path, "mode", mode, f"one of {', '.join(MODES)}")
@@ -300,7 +299,7 @@ def _image_path(path: Path, name: object, allow_outside: bool) -> Path:
     return image_path
 
 
-def _read_image(path: Path, name: object, mode: str, allow_outside: bool) -> GreyImage:
+def _read_image(path: Path, name: object, mode: str, allow_outside: bool) -> GrayImage:
     """The pixels of the image a YAML file names."""
     image_path = _image_path(path, name, allow_outside)
     try:

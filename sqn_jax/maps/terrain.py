@@ -59,29 +59,29 @@ def wall_edges(count: int, size: int) -> list[int]:
     return [k * (size - WALL) // count for k in range(count + 1)]
 
 
-def disc(size: int, centre: ArrayLike, radius: float) -> Window:
-    """The cells with their centres within `radius` m of `centre` (x, y) m."""
-    where, x, y = _window(size, centre, radius)
+def disc(size: int, center: ArrayLike, radius: float) -> Window:
+    """The cells with their centers within `radius` m of `center` (x, y) m."""
+    where, x, y = _window(size, center, radius)
     return where, x**2 + y**2 <= radius**2
 
 
 def asterisk(
     size: int,
-    centre: ArrayLike,
+    center: ArrayLike,
     angles: Sequence[float],
     lengths: Sequence[float],
     half_width: float,
 ) -> Window:
-    """Straight arms from a centre: the cells within `half_width` of one.
+    """Straight arms from a center: the cells within `half_width` of one.
 
     Args:
-      size: cells a side.
-      centre: (x, y), m.
-      angles: rad, counter-clockwise from +x, one an arm.
-      lengths: m, one an arm.
-      half_width: m.
+        size: cells a side.
+        center: (x, y), m.
+        angles: rad, counter-clockwise from +x, one an arm.
+        lengths: m, one an arm.
+        half_width: m.
     """
-    where, x, y = _window(size, centre, max(lengths) + half_width)
+    where, x, y = _window(size, center, max(lengths) + half_width)
     cells = np.zeros(np.broadcast_shapes(x.shape, y.shape), dtype=bool)
     for angle, length in zip(angles, lengths, strict=True):
         cos, sin = math.cos(angle), math.sin(angle)
@@ -101,10 +101,10 @@ def round_crooks(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _window(
-    size: int, centre: ArrayLike, reach: float
+    size: int, center: ArrayLike, reach: float
 ) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]]:
     """The part of the map within `reach` m of a point; its cells' x [1, C] and y [R, 1] from it."""
-    middle = np.asarray(centre, dtype=np.float64) / RESOLUTION
+    middle = np.asarray(center, dtype=np.float64) / RESOLUTION
     first = np.maximum(np.floor(middle - reach / RESOLUTION).astype(int), 0)
     last = np.minimum(np.ceil(middle + reach / RESOLUTION).astype(int), size)
     x = (np.arange(first[0], last[0]) + 0.5 - middle[0]) * RESOLUTION
@@ -118,9 +118,9 @@ def value_noise(
     """Smooth noise [size, size]: random lattices, interpolated, one for each of the `octaves`.
 
     Args:
-      size: cells a side.
-      octaves: (wavelength m, amplitude); one of amplitude a lies in -a..a.
-      rng: where the lattices' values come from.
+        size: cells a side.
+        octaves: (wavelength m, amplitude); one of amplitude a lies in -a..a.
+        rng: where the lattices' values come from.
     """
     total = np.zeros((size, size))
     for wavelength, amplitude in octaves:
@@ -138,7 +138,7 @@ def smooth_path(points: ArrayLike) -> NDArray[np.float64]:
     """A polyline [P, C] with its corners cut (Chaikin), sampled at least once a cell; ends stay.
 
     Args:
-      points: [P, C], P >= 2; the first two columns are (x, y) in m, the rest are carried along.
+        points: [P, C], P >= 2; the first two columns are (x, y) in m, the rest are carried along.
     """
     path = np.asarray(points, dtype=np.float64)
     for _ in range(3):
@@ -162,12 +162,12 @@ def carve_tunnels(
     0.55 m to either side, whatever the roughness.
 
     Args:
-      size: cells a side.
-      paths: each [P, 3], the course of a tunnel: x m, y m, half its width m.
-      rng: for the winding and the roughness.
+        size: cells a side.
+        paths: each [P, 3], the course of a tunnel: x m, y m, half its width m.
+        rng: for the winding and the roughness.
 
     Returns:
-      occupied: bool [size, size], closed at the border.
+        occupied: bool [size, size], closed at the border.
     """
     shift = [value_noise(size, _WINDING, rng) for _ in range(2)]
     half_width = np.zeros((size, size))
@@ -212,9 +212,9 @@ def fill_pockets(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
         occupied = occupied | pockets | (rim & ~ndimage.binary_dilation(main, _BODY))
 
 
-def roomy_cells(occupied: NDArray[np.bool_], room: float) -> NDArray[np.int64]:
-    """Cells (row, col) [C, 2] with at least `room` m to the nearest obstacle, row by row."""
-    return np.argwhere(is_clear(occupied, room / RESOLUTION))
+def clear_cells(occupied: NDArray[np.bool_], clearance: float) -> NDArray[np.int64]:
+    """Cells (row, col) [C, 2] with at least `clearance` m to the nearest obstacle, row by row."""
+    return np.argwhere(is_clear(occupied, clearance / RESOLUTION))
 
 
 def spread(cells: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -243,21 +243,21 @@ def finish_map(
     evaluation_points: Sequence[ArrayLike],
     *,
     spawn_count: int,
-    room: float,
+    clearance: float,
     max_steps: int = 400,
 ) -> OccupancyMap:
     """The map with its pockets filled, and with spawn points spread over it.
 
     Args:
-      name: the map's name.
-      occupied: bool [size, size].
-      evaluation_points: (x, y) m each; every one is moved to the nearest cell with `room` around.
-      spawn_count: at most so many spawn points.
-      room: m from every spawn and evaluation point to the nearest obstacle, at least.
-      max_steps: length of an episode.
+        name: the map's name.
+        occupied: bool [size, size].
+        evaluation_points: (x, y) m each; each is moved to the nearest cell with this clearance.
+        spawn_count: at most so many spawn points.
+        clearance: m from every spawn and evaluation point to the nearest obstacle, at least.
+        max_steps: length of an episode.
     """
     occupied = fill_pockets(occupied)
-    cells = roomy_cells(occupied, room)
+    cells = clear_cells(occupied, clearance)
     marked = np.array([nearest_cell(cells, point) for point in evaluation_points])
     return OccupancyMap(
         name=name,

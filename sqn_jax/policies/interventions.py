@@ -84,9 +84,9 @@ def single_head(policy: Policy, skill: int = 0) -> Policy:
         head, embedding = modules[f"skill_{skill}"], modules[f"skill_{skill}_embedding"]
         hidden = head["hidden"]
         bias = hidden["bias"] + embedding @ hidden["kernel"]
-        kept = {name: modules[name] for name in ("features", "perception")}
-        kept["skill_0"] = {**head, "hidden": {**hidden, "bias": bias}}
-        return {**params, "params": kept}
+        selected = {name: modules[name] for name in ("features", "perception")}
+        selected["skill_0"] = {**head, "hidden": {**hidden, "bias": bias}}
+        return {**params, "params": selected}
 
     config = dataclasses.replace(policy.config, algo="r2d2")
     return Policy(policy.name, config, tuple(reduced(params) for params in policy.params))

@@ -28,29 +28,29 @@ PREFIX = "pretrained:"
 SUFFIX = ".npz"
 
 
-def find_policy(word: str, checkpoint: int | str = "newest") -> Policy:
+def find_policy(name: str, checkpoint: int | str = "newest") -> Policy:
     """A policy by the name a user gives: a run folder, `pretrained:NAME`, or a file NAME.npz.
 
     Args:
-        word: the name.
+        name: as the user gives it.
         checkpoint: of a run, see `run_policies.load_policy`; other policies have but one.
 
     Raises:
         ValueError: there is none, or it is damaged.
     """
-    if names_a_run(word):
-        return load_policy(Path(word), checkpoint)
+    if names_a_run(name):
+        return load_policy(Path(name), checkpoint)
     if checkpoint != "newest":
-        raise ValueError(f"{word}: has no checkpoint {checkpoint}, expected newest")
-    if word.startswith(PREFIX):
-        return load_pretrained(word.removeprefix(PREFIX))
-    path = Path(word)
+        raise ValueError(f"{name}: has no checkpoint {checkpoint}, expected newest")
+    if name.startswith(PREFIX):
+        return load_pretrained(name.removeprefix(PREFIX))
+    path = Path(name)
     return read_policy(path.parent, path.stem)
 
 
-def names_a_run(word: str) -> bool:
+def names_a_run(name: str) -> bool:
     """Whether a policy's name is that of a run folder, with all that a run leaves."""
-    return not (word.startswith(PREFIX) or word.endswith(SUFFIX))
+    return not (name.startswith(PREFIX) or name.endswith(SUFFIX))
 
 
 def pretrained_names() -> list[str]:
@@ -66,7 +66,7 @@ def load_pretrained(name: str) -> Policy:
         ValueError: there is none of this name.
     """
     if name not in pretrained_names():
-        known = ", ".join(PREFIX + each for each in pretrained_names()) or "none"
+        known = ", ".join(PREFIX + known_name for known_name in pretrained_names()) or "none"
         raise ValueError(f"{PREFIX}{name}: no such policy, expected one of {known}")
     return read_policy(_folder(), name)
 
@@ -78,10 +78,10 @@ def read_policy(folder: Traversable, name: str) -> Policy:
         ValueError: a file is missing or damaged, or the arrays are not those of the network.
     """
     try:
-        told = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        config = configs.from_dict(told["config"])
+        description = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        config = configs.from_dict(description["config"])
         packed = (folder / f"{name}.npz").read_bytes()
-        if hashlib.sha256(packed).hexdigest() != told["sha256"]:
+        if hashlib.sha256(packed).hexdigest() != description["sha256"]:
             raise ValueError(f"{name}.npz is not the file that {name}.json belongs to")
         with np.load(io.BytesIO(packed), allow_pickle=False) as file:
             arrays = {path: file[path] for path in file.files}
@@ -112,15 +112,15 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
 
 
 def _folder() -> Traversable:
-    return resources.files("sqn_jax") / "weights"
+    return resources.files("sqn_jax.policies") / "weights"
 
 
 def _tree(arrays: Mapping[str, Any], config: TrainConfig, name: str) -> Any:
     expected = traverse_util.flatten_dict(params_shapes(config), sep="/")
     for path in sorted(expected.keys() | arrays.keys()):
         wanted = expected[path].shape if path in expected else None
-        found = arrays[path].shape if path in arrays else None
-        if wanted != found:
-            raise ValueError(f"policy {name}: array {path} is {found}, expected {wanted}")
-    given = {path: jnp.asarray(array, expected[path].dtype) for path, array in arrays.items()}
-    return traverse_util.unflatten_dict(given, sep="/")
+        shape = arrays[path].shape if path in arrays else None
+        if wanted != shape:
+            raise ValueError(f"policy {name}: array {path} is {shape}, expected {wanted}")
+    loaded = {path: jnp.asarray(array, expected[path].dtype) for path, array in arrays.items()}
+    return traverse_util.unflatten_dict(loaded, sep="/")

@@ -13,12 +13,12 @@ from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Run, gather_content, read_runs
 from sqn_jax.report.page import require_writable, to_html, write_page
 from sqn_jax.report.pictures import draw_pictures
-from sqn_jax.storage.compile_cache import kept_programs
+from sqn_jax.storage.compile_cache import cached_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 
 
-@kept_programs()
+@cached_programs()
 def write_report(
     runs: Sequence[Run], settings: Settings, out: Path, *, baselines: bool = True
 ) -> None:

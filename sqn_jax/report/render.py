@@ -24,7 +24,7 @@ from sqn_jax.evaluation.settings import Settings, Tasks, World, robot_for, task_
 from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.policies.run_policies import Policy
-from sqn_jax.storage.compile_cache import kept_programs
+from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import probe_writable, written_whole
 
 MOST_EPISODES = 32
@@ -33,7 +33,7 @@ MOST_EPISODES = 32
 EpisodesByAgent = Mapping[str, list[Episode]]
 
 
-@kept_programs()
+@cached_programs()
 def render_session(
     policies: Sequence[Policy],
     out: Path,

@@ -10,11 +10,11 @@ from sqn_jax.evaluation.agents import Agent
 from sqn_jax.evaluation.compare import OnEvaluated, evaluate_agents, load_maps, num_episodes
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.runs.progress import episodes_bar
-from sqn_jax.storage.compile_cache import kept_programs
+from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import write_json, write_records
 
 
-@kept_programs()
+@cached_programs()
 def evaluate_session(
     agents: Sequence[Agent],
     settings: Settings,

@@ -29,7 +29,7 @@ from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
 from sqn_jax.storage import manifest
 from sqn_jax.storage.checkpoint import Checkpoints, chunks_in
-from sqn_jax.storage.compile_cache import kept_programs, watched_compilation
+from sqn_jax.storage.compile_cache import cached_programs, watched_compilation
 from sqn_jax.storage.lock import locked
 from sqn_jax.storage.manifest import Manifest, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder
@@ -47,7 +47,7 @@ from sqn_jax.training.loop import (
 from sqn_jax.training.state import RunnerState, memory_bytes
 
 
-@kept_programs()
+@cached_programs()
 def train_session(
     config: TrainConfig,
     run_dir: Path,

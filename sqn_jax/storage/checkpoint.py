@@ -1,6 +1,6 @@
 """Saving and loading the state of a run with Orbax.
 
-A checkpoint holds the whole `RunnerState`: parameters, optimiser, replay, keys and the round, and a
+A checkpoint holds the whole `RunnerState`: parameters, optimizer, replay, keys and the round, and a
 manifest (`manifest.py`) that is compared with it before anything is used. The parameters of the
 policy stand apart, so that it can be loaded without the rest; so does the replay, which can be left
 out.
@@ -32,7 +32,7 @@ from sqn_jax.storage.manifest import Damaged, Manifest, Mismatch, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS
 from sqn_jax.training.state import RunnerState
 
-KEPT = 2
+NUM_NEWEST = 2
 """How many of the newest are kept; the best one besides."""
 
 OVERHEAD_BYTES = 2**21
@@ -95,8 +95,8 @@ class Checkpoints:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._sweep()
             _require_space(self._folder, items)
-            told = {name: ocp.args.StandardSave(item) for name, item in items.items()}
-            self._orbax.save(partial, args=ocp.args.Composite(**told))
+            arguments = {name: ocp.args.StandardSave(item) for name, item in items.items()}
+            self._orbax.save(partial, args=ocp.args.Composite(**arguments))
             manifest.write(partial, items, self._origin, chunk=chunk, score=score, exact=exact)
             self._set_aside(chunk)
             partial.rename(self._place(chunk))
@@ -119,18 +119,18 @@ class Checkpoints:
         faults = []
         for chunk in reversed(self._require_some()):
             try:
-                told = manifest.read(self._place(chunk), chunk)
+                description = manifest.read(self._place(chunk), chunk)
             except Damaged as error:
                 faults.append((chunk, f"checkpoint {self._place(chunk)}: damaged, {error}"))
                 continue
             items = _split(runner_shapes)
-            if not told.is_exact:
+            if not description.is_exact:
                 items.pop("memory", None)
-            restored = self._restored(chunk, told, items)
+            restored = self._restored(chunk, description, items)
             for damaged, fault in faults:
                 warnings.warn(f"{fault}; going on from chunk {chunk}", UserWarning, stacklevel=2)
                 self._set_aside(damaged)
-            return _join(restored), told
+            return _join(restored), description
         raise ValueError("; ".join(fault for _, fault in faults))
 
     def restore_policy(
@@ -151,15 +151,15 @@ class Checkpoints:
         chunk = self._chosen(which)
         name = "target_params" if averaged else "params"
         try:
-            found = manifest.read(self._place(chunk), chunk, (name,))
+            description = manifest.read(self._place(chunk), chunk, (name,))
         except Damaged as error:
-            told = f"checkpoint {self._place(chunk)}: damaged, {error}"
-            older = [each for each in self.chunks() if each < chunk and self._is_sound(each)]
+            message = f"checkpoint {self._place(chunk)}: damaged, {error}"
+            older = [sound for sound in self.chunks() if sound < chunk and self._is_sound(sound)]
             if older:
-                told += f"; that of chunk {older[-1]} is sound: --resume goes on from it, "
-                told += f"--checkpoint {older[-1]} takes it"
-            raise ValueError(told) from None
-        return self._restored(chunk, found, {name: params_shapes})[name]
+                message += f"; that of chunk {older[-1]} is sound: --resume goes on from it, "
+                message += f"--checkpoint {older[-1]} takes it"
+            raise ValueError(message) from None
+        return self._restored(chunk, description, {name: params_shapes})[name]
 
     def _chosen(self, which: int | str) -> int:
         chunks = self._require_some()
@@ -172,13 +172,13 @@ class Checkpoints:
         known = ", ".join(str(chunk) for chunk in chunks)
         raise ValueError(f"{self._folder}: no checkpoint {which}, expected newest, best or {known}")
 
-    def _restored(self, chunk: int, told: Manifest, shapes: dict[str, Any]) -> Any:
+    def _restored(self, chunk: int, description: Manifest, shapes: dict[str, Any]) -> Any:
         """Trees of the given shapes; on the first device where these do not name any.
 
-        Wherever the arrays lay when they were saved: a run on two devices goes on on one.
+        Wherever the arrays lay when they were saved: a run on two devices can resume on one.
         """
         place = self._place(chunk)
-        rows = manifest.differences(told, self._origin, shapes)
+        rows = manifest.differences(description, self._origin, shapes)
         if rows:
             raise Mismatch(f"checkpoint {place}: not of this run as it is set up here", rows)
         items = {name: ocp.args.StandardRestore(_placed(item)) for name, item in shapes.items()}
@@ -189,7 +189,7 @@ class Checkpoints:
             raise ValueError(
                 f"checkpoint {place}: cannot be restored ({type(error).__name__}: {reason})"
             ) from None
-        wrong = manifest.wrong_leaf(told, {name: restored[name] for name in shapes})
+        wrong = manifest.wrong_leaf(description, {name: restored[name] for name in shapes})
         if wrong is not None:
             raise ValueError(f"checkpoint {place}: {wrong} was restored with other numbers")
         return restored
@@ -223,9 +223,9 @@ class Checkpoints:
     def _prune(self) -> None:
         """Delete all but the newest ones and the best."""
         chunks = self.chunks()
-        kept = {*chunks[-KEPT:], self._best(chunks)}
+        selected = {*chunks[-NUM_NEWEST:], self._best(chunks)}
         for chunk in chunks:
-            if chunk not in kept:
+            if chunk not in selected:
                 gone = self._place(chunk).with_name(f".{chunk}.old")
                 with suppress(OSError):
                     self._place(chunk).rename(gone)
@@ -238,7 +238,7 @@ class Checkpoints:
                 shutil.rmtree(path, ignore_errors=True)
 
     def _set_aside(self, chunk: int) -> None:
-        """Make room where a checkpoint stands that is of no use; it can be looked at still."""
+        """Move an unusable checkpoint aside, where it can still be inspected."""
         place = self._place(chunk)
         if place.exists():
             aside = place.with_name(f"{chunk}.damaged")
@@ -254,7 +254,7 @@ class Checkpoints:
 def _require_space(folder: Path, items: dict[str, Any]) -> None:
     """Refuse to begin what a disk has no room for.
 
-    Orbax's file library goes on writing in threads of its own after a write has failed, and each
+    Orbax's file library continues to write in threads of its own after a write has failed, and each
     of them prints a traceback.
     """
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(items)) + OVERHEAD_BYTES
@@ -268,13 +268,13 @@ def _require_space(folder: Path, items: dict[str, Any]) -> None:
 
 def _reason(error: Exception) -> str:
     """What the system said, out of the long story of a library."""
-    told = " ".join(str(error).split())
+    message = " ".join(str(error).split())
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EIO):
-        if os.strerror(number) in told:
+        if os.strerror(number) in message:
             return os.strerror(number)
-    return told[:200] or type(error).__name__
+    return message[:200] or type(error).__name__
 
 
 def _flush_folder(folder: Path) -> None:

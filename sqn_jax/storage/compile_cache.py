@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk, so that the next start reads them instead of compiling.
+"""Compiled programs cached on disk, so that the next start reads them instead of compiling.
 
 JAX does the keeping (its persistent compilation cache). What is read is executed: the folder is
 private, and one that others can write to is not used. Whoever imports the library gets no cache.
@@ -40,7 +40,7 @@ _TROUBLE = re.compile(
 
 
 @contextmanager
-def kept_programs() -> Iterator[None]:
+def cached_programs() -> Iterator[None]:
     """Keep and reuse compiled programs within this context, if a folder for them can be used.
 
     If not, one line on stderr says why. A cache the user has set up for JAX itself
@@ -63,7 +63,7 @@ def kept_programs() -> Iterator[None]:
     for name, value in options.items():
         jax.config.update(name, value)
     try:
-        with _sealed(folder), _told_in_one_line(folder):
+        with _sealed(folder), _warnings_in_one_line(folder):
             yield
     finally:
         for name, value in before.items():
@@ -73,7 +73,7 @@ def kept_programs() -> Iterator[None]:
 
 @contextmanager
 def watched_compilation() -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether all that was compiled meanwhile came from the cache."""
+    """Yield a function that returns whether all that was compiled meanwhile came from the cache."""
     seen: Counter[str] = Counter()
 
     def note(event: str, **_: object) -> None:
@@ -98,8 +98,8 @@ def _open_folder(chosen: str) -> Path | None:
             caches = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
         folder = Path(chosen).expanduser() if chosen else caches / "sqn_jax" / "compiled"
         folder = folder.resolve()
-        for each in (*reversed(folder.parents), folder):
-            each.mkdir(mode=0o700, exist_ok=True)
+        for parent in (*reversed(folder.parents), folder):
+            parent.mkdir(mode=0o700, exist_ok=True)
         fault = _danger(folder)
         if fault is None:
             probe_writable(folder)
@@ -117,12 +117,12 @@ def _danger(folder: Path) -> str | None:
     """Who else could put programs there; None if nobody."""
     if folder.stat().st_uid != os.geteuid():
         return f"{folder} belongs to somebody else"
-    for each in (folder, *folder.parents):
-        mode = each.stat().st_mode
+    for path in (folder, *folder.parents):
+        mode = path.stat().st_mode
         # Where the sticky bit is set, as on /tmp, nobody can replace what others have there.
-        is_sticky = each != folder and mode & stat.S_ISVTX
+        is_sticky = path != folder and mode & stat.S_ISVTX
         if mode & (stat.S_IWGRP | stat.S_IWOTH) and not is_sticky:
-            return f"others may write to {each}"
+            return f"others may write to {path}"
     return None
 
 
@@ -134,20 +134,20 @@ def _tidy(folder: Path) -> None:
     gives wrong numbers. JAX's own limit needs another package, and fails for good once a process
     was killed between an entry and its time stamp.
     """
-    room, damaged = LARGEST_BYTES, 0
+    bytes_left, damaged = LARGEST_BYTES, 0
     entries = folder.glob(f"*{ENTRY}")
-    for entry in sorted(entries, key=lambda each: each.stat().st_mtime, reverse=True):
+    for entry in sorted(entries, key=lambda path: path.stat().st_mtime, reverse=True):
         seal = _seal_of(entry)
         is_sealed = seal.exists()  # Else a process was killed before it was finished.
         is_sound = is_sealed and seal.read_bytes() == _digest(entry)
         damaged += is_sealed and not is_sound
-        room -= entry.stat().st_size if is_sound else 0
-        if not is_sound or room < 0:
+        bytes_left -= entry.stat().st_size if is_sound else 0
+        if not is_sound or bytes_left < 0:
             entry.unlink(missing_ok=True)
             seal.unlink(missing_ok=True)
     if damaged:
-        told = f"compiled programs in {folder}: {damaged} damaged, to be compiled again"
-        print(told, file=sys.stderr)
+        message = f"compiled programs in {folder}: {damaged} damaged, to be compiled again"
+        print(message, file=sys.stderr)
 
 
 @contextmanager
@@ -176,8 +176,8 @@ def _digest(path: Path) -> bytes:
 
 
 @contextmanager
-def _told_in_one_line(folder: Path) -> Iterator[None]:
-    """Tell of the first program that JAX cannot read or write, and delete what there is of each."""
+def _warnings_in_one_line(folder: Path) -> Iterator[None]:
+    """Report the first program that JAX cannot read or write, and delete the files of each."""
     troubles: set[str] = set()
     with warnings.catch_warnings():
         show_others = warnings.showwarning
@@ -192,9 +192,9 @@ def _told_in_one_line(folder: Path) -> Iterator[None]:
                 for path in folder.glob(f"{program}-*"):
                     path.unlink(missing_ok=True)
             if verb not in troubles:
-                told = f"{verb} {program} failed ({' '.join(reason.split())})"
+                failure = f"{verb} {program} failed ({' '.join(reason.split())})"
                 # Through tqdm, since a progress bar may be on the screen.
-                tqdm.write(f"compiled programs in {folder}: {told}; going on", file=sys.stderr)
+                tqdm.write(f"compiled programs in {folder}: {failure}; going on", file=sys.stderr)
             troubles.add(verb)
 
         warnings.showwarning = show

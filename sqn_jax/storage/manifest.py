@@ -1,4 +1,4 @@
-"""What a checkpoint holds, in a file of its own: damage and mix-ups are found before it is used.
+"""What a checkpoint holds, in a file of its own: damage and mix-ups are detected before it is used.
 
 Orbax writes a step as a whole or not at all, but reads whatever it finds: one wrong bit loads as a
 wrong number. The manifest has the SHA-256 of every file and of every array, the settings and the
@@ -62,7 +62,7 @@ class Origin:
 
     config: TrainConfig
     world: Mapping[str, Any] | None = None
-    """What tells its map from others (`OccupancyMap.identity`); None where no map is at hand."""
+    """What identifies its map (`OccupancyMap.identity`); None where no map is at hand."""
     num_devices: int = 1
 
 
@@ -74,7 +74,7 @@ class Manifest:
 
     @property
     def is_exact(self) -> bool:
-        """Whether a run goes on from it exactly as it would have."""
+        """Whether a run resumes from it exactly as it would have gone on."""
         return bool(self.contents["exact"])
 
     @property
@@ -127,9 +127,9 @@ def write(
             for path in _files(folder)
         },
     }
-    told = {"contents": contents, "sha256": _contents_digest(contents)}
+    entry = {"contents": contents, "sha256": _contents_digest(contents)}
     with (folder / NAME).open("w", encoding="utf-8") as file:
-        json.dump(told, file, indent=1)
+        json.dump(entry, file, indent=1)
         file.flush()
         flush_to_disk(file.fileno())
 
@@ -148,16 +148,16 @@ def read(folder: Path, chunk: int, items: Iterable[str] | None = None) -> Manife
     contents = _contents(folder)
     if contents["chunk"] != chunk:
         raise Damaged(f"{NAME} is that of chunk {contents['chunk']}")
-    found = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
-    for name in sorted(contents["files"].keys() | found.keys()):
+    files = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
+    for name in sorted(contents["files"].keys() | files.keys()):
         if items is not None and "/" in name and name.split("/")[0] not in items:
             continue
-        if name not in found:
+        if name not in files:
             raise Damaged(f"{name} is missing")
         if name not in contents["files"]:
             raise Damaged(f"{name} does not belong to it")
         try:
-            digest = _file_digest(found[name])
+            digest = _file_digest(files[name])
         except OSError as error:
             raise Damaged(f"{name} cannot be read ({error.strerror})") from None
         if digest != contents["files"][name]:
@@ -168,15 +168,15 @@ def read(folder: Path, chunk: int, items: Iterable[str] | None = None) -> Manife
 def _contents(folder: Path) -> dict[str, Any]:
     """The contents of a manifest that is whole."""
     try:
-        told = json.loads((folder / NAME).read_text(encoding="utf-8"))
+        entry = json.loads((folder / NAME).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise Damaged(f"{NAME} is missing") from None
     except OSError as error:
         raise Damaged(f"{NAME} cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError):
         raise Damaged(f"{NAME} is not what was written") from None
-    contents = told.get("contents") if isinstance(told, dict) else None
-    if not isinstance(contents, dict) or told.get("sha256") != _contents_digest(contents):
+    contents = entry.get("contents") if isinstance(entry, dict) else None
+    if not isinstance(contents, dict) or entry.get("sha256") != _contents_digest(contents):
         raise Damaged(f"{NAME} is not what was written")
     if contents.get("schema") != SCHEMA:
         raise ValueError(
@@ -246,13 +246,13 @@ def differences(
     ]
 
 
-def _settings(told: dict[str, Any]) -> dict[str, Any]:
+def _settings(saved: dict[str, Any]) -> dict[str, Any]:
     """Settings as they were saved; those that have come since have their defaults, which are to
     mean what was done before there were any."""
     try:
-        return configs.flat(configs.to_dict(configs.from_dict(told)))
+        return configs.flat(configs.to_dict(configs.from_dict(saved)))
     except ValueError:  # There were settings that are no more: they are shown as differences.
-        return configs.flat(told)
+        return configs.flat(saved)
 
 
 def wrong_leaf(manifest: Manifest, items: Mapping[str, Any]) -> str | None:
@@ -275,8 +275,8 @@ def versions() -> dict[str, str]:
 
 def leaves_of(items: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """Every array of some trees with its path, `params/params/perception/input_kernel`."""
-    found, _ = jax.tree_util.tree_flatten_with_path(dict(items))
-    return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in found]
+    leaves, _ = jax.tree_util.tree_flatten_with_path(dict(items))
+    return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves]
 
 
 def leaf_digest(leaf: Any) -> str:

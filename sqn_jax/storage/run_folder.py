@@ -88,7 +88,7 @@ class RunFolder:
         write_whole(self.path / CONFIG, json.dumps(configs.to_dict(config), indent=2) + "\n")
 
     def unfinish(self) -> None:
-        """Take away what says that the run is finished: it goes on."""
+        """Remove the mark that the run is finished: it is resumed."""
         (self.path / SUMMARY).unlink(missing_ok=True)
 
     def append_metrics(self, row: Mapping[str, Any]) -> None:
@@ -145,8 +145,8 @@ class RunFolder:
         path = self.path / METRICS
         if path.exists() and not path.is_file():
             raise ValueError(f"{path}: expected a file")
-        kept = [row for row in self.read_metrics() if row["chunk"] <= chunks]
-        write_whole(self.path / METRICS, "".join(json.dumps(row) + "\n" for row in kept))
+        rows = [row for row in self.read_metrics() if row["chunk"] <= chunks]
+        write_whole(self.path / METRICS, "".join(json.dumps(row) + "\n" for row in rows))
 
     def write_json(self, name: str, data: Mapping[str, Any]) -> None:
         """Write a JSON file of the folder as a whole or not at all."""

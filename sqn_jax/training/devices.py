@@ -48,21 +48,21 @@ def require(kind: str | None) -> None:
     """Choose the kind of device before JAX starts its devices, and see that there is one.
 
     Args:
-        kind: "cpu", "gpu" or "tpu"; None takes what there is, an accelerator before the CPU.
+        kind: "cpu", "gpu" or "tpu"; None takes an accelerator if there is one, else the CPU.
 
     Raises:
-        ValueError: there is none of this kind, or none that JAX was told to use.
+        ValueError: there is none of this kind, or none that JAX may use.
     """
     if kind == "cpu":
         jax.config.update("jax_platforms", "cpu")
     try:
-        found = jax.devices()[0].platform
+        backend = jax.devices()[0].platform
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"JAX finds no device as it is set up here ({reason})") from None
-    if kind is not None and found != kind:
-        raise ValueError(f"--device is {kind}, expected one that JAX finds here: {found}")
-    if kind is None and found == "cpu" and not os.environ.get("JAX_PLATFORMS") and _has_nvidia():
+    if kind is not None and backend != kind:
+        raise ValueError(f"--device is {kind}, expected one that JAX finds here: {backend}")
+    if kind is None and backend == "cpu" and not os.environ.get("JAX_PLATFORMS") and _has_nvidia():
         print(
             "there is an NVIDIA GPU, but this JAX cannot use it: running on the CPU "
             "(pip install 'jax[cuda12]')",
@@ -83,7 +83,7 @@ def describe(mesh: Mesh | None = None) -> str:
 
 
 def cpu_model() -> str:
-    """The processor by name, as well as the system tells it."""
+    """The processor by name, as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

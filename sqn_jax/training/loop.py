@@ -233,7 +233,7 @@ def compile_chunk(env_params: EnvParams, program: Program) -> tuple[CompiledChun
     """Compile `train_chunk`; returns it and the seconds it took.
 
     It is compiled from shapes: arrays from a checkpoint are bound to their device, and what is
-    compiled for those is not what a new run has compiled and kept.
+    compiled for those is not what a new run has compiled and stored.
     """
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), program.mesh)

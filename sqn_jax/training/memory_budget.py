@@ -50,7 +50,7 @@ def compiled_bytes(compiled: Any) -> float:
 
 
 def available_bytes() -> float | None:
-    """Bytes that can still be allocated where a run would be; None where nobody knows."""
+    """Bytes that can still be allocated where a run would be; None if unknown."""
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}

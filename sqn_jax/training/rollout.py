@@ -109,7 +109,7 @@ def unroll(
         network: the agent.
 
     Returns:
-        The robots afterwards, and all that happened but for `covered`. In a compiled program what
+        The robots afterward, and all that happened but for `covered`. In a compiled program what
         nobody uses of it costs nothing.
     """
     body = partial(_act_and_step, params=params, epsilon=epsilon, env_params=env_params)

@@ -281,9 +281,9 @@ def test_oracle_refuses_another_map_and_a_robot_that_cannot_turn() -> None:
     with pytest.raises(ValueError, match=r"has \(100, 120\) cells, expected \(80, 120\)"):
         run_oracle(other, world, 1)
     fixed = make_env(small, EnvConfig(turn_rate=0.0))
-    with pytest.raises(ValueError, match="cannot drive or turn"):
+    with pytest.raises(ValueError, match="cannot move or turn"):
         Oracle(small, fixed, np.array([[5.025, 2.025]]))
-    with pytest.raises(ValueError, match="cannot drive or turn"):
+    with pytest.raises(ValueError, match="cannot move or turn"):
         BugNavigator(fixed.config, 1)
 
 

@@ -1,11 +1,11 @@
-"""Maps and drives that several of the simulator's tests look at; each is made once."""
+"""Maps and rollouts that several of the simulator's tests look at; each is made once."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from driving import Drive, drive
 from grid_oracle import BOOLS, open_map, random_map, wrap_map
+from rollouts import Rollout, run_robots
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env
@@ -57,29 +57,29 @@ def hall_params(hall: OccupancyMap) -> EnvParams:
 
 
 @pytest.fixture(scope="session")
-def maze_drive(maze_params: EnvParams) -> Drive:
+def maze_rollout(maze_params: EnvParams) -> Rollout:
     """Whole episodes in the maze."""
-    return drive(maze_params, seed=0, robots=16)
+    return run_robots(maze_params, seed=0, robots=16)
 
 
 @pytest.fixture(scope="session")
-def hall_drive(hall_params: EnvParams) -> Drive:
+def hall_rollout(hall_params: EnvParams) -> Rollout:
     """Whole episodes in the hall."""
-    return drive(hall_params, seed=1, robots=16)
+    return run_robots(hall_params, seed=1, robots=16)
 
 
 @pytest.fixture(
     scope="session",
     params=["maze", "hall", "thin walls, point robot, noise", "clutter, wide robot, noise"],
 )
-def any_drive(request: pytest.FixtureRequest) -> tuple[BOOLS, float, Drive]:
+def any_rollout(request: pytest.FixtureRequest) -> tuple[BOOLS, float, Rollout]:
     """Occupied cells, robot radius m, and whole episodes, with and without noise."""
     if request.param == "maze":
         occupied = request.getfixturevalue("maze").occupied
-        return occupied, 0.1, request.getfixturevalue("maze_drive")
+        return occupied, 0.1, request.getfixturevalue("maze_rollout")
     if request.param == "hall":
         occupied = request.getfixturevalue("hall").occupied
-        return occupied, 0.1, request.getfixturevalue("hall_drive")
+        return occupied, 0.1, request.getfixturevalue("hall_rollout")
     if request.param.startswith("thin walls"):
         occupancy_map, radius = request.getfixturevalue("thin_walls"), 0.0
     else:
@@ -87,4 +87,4 @@ def any_drive(request: pytest.FixtureRequest) -> tuple[BOOLS, float, Drive]:
         points = sample_spawn_points(occupied, 0.05, 0.25, count=6)
         occupancy_map, radius = wrap_map(occupied, points), 0.25
     params = make_env(occupancy_map, EnvConfig(robot_radius=radius, velocity_noise=0.3))
-    return occupancy_map.occupied, radius, drive(params, seed=3, robots=32)
+    return occupancy_map.occupied, radius, run_robots(params, seed=3, robots=32)

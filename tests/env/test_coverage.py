@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from driving import Drive
 from grid_oracle import open_map, random_map, seen_areas, wrap_map
+from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
@@ -34,7 +34,7 @@ def test_the_area_of_whole_episodes_is_within_two_percent_of_a_dense_brute_force
 ) -> None:
     occupancy_map: OccupancyMap = request.getfixturevalue(place)
     params: EnvParams = request.getfixturevalue(f"{place}_params")
-    run: Drive = request.getfixturevalue(f"{place}_drive")
+    run: Rollout = request.getfixturevalue(f"{place}_rollout")
     error = []
     # Half of the robots act at random, half wander; two of each are looked at.
     for robot in (0, 1, -2, -1):
@@ -50,13 +50,13 @@ def test_the_area_of_whole_episodes_is_within_two_percent_of_a_dense_brute_force
 
 
 def test_the_growth_of_a_step_is_the_area_added_to_the_coverage(
-    hall_drive: Drive, hall_params: EnvParams
+    hall_rollout: Rollout, hall_params: EnvParams
 ) -> None:
-    area = covered_area(hall_drive.covered, hall_params.config.coverage_cell)
-    growth = hall_drive.info["covered_area"]
+    area = covered_area(hall_rollout.covered, hall_params.config.coverage_cell)
+    growth = hall_rollout.info["covered_area"]
     np.testing.assert_allclose(growth, np.diff(area, axis=1), atol=1e-3)
     assert np.all(growth >= 0)
-    forgotten = hall_drive.covered[:, :-1] & ~hall_drive.covered[:, 1:]
+    forgotten = hall_rollout.covered[:, :-1] & ~hall_rollout.covered[:, 1:]
     assert not forgotten.any()
 
 

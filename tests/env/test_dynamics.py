@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from driving import Drive
 from grid_oracle import BOOLS, cast, clearance, open_map, wrap_map
+from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
@@ -55,26 +55,26 @@ def go(pose, velocity, params: EnvParams, time_step: float = 0.1) -> tuple[np.nd
 
 
 def test_no_pose_of_a_whole_episode_lies_in_an_obstacle(
-    any_drive: tuple[BOOLS, float, Drive],
+    any_rollout: tuple[BOOLS, float, Rollout],
 ) -> None:
-    occupied, _, run = any_drive
+    occupied, _, run = any_rollout
     column, row = np.floor(run.poses[..., :2].astype(np.float64) / 0.05).astype(int).T
     assert not occupied[row, column].any()
 
 
 def test_the_body_keeps_its_radius_from_obstacles_to_half_a_cell(
-    any_drive: tuple[BOOLS, float, Drive],
+    any_rollout: tuple[BOOLS, float, Rollout],
 ) -> None:
     # The centre may be anywhere in a cell whose centre is a radius away: 0.05 / sqrt 2 = 0.0354.
-    occupied, radius, run = any_drive
+    occupied, radius, run = any_rollout
     places = np.unique(run.poses[:, ::5, :2].reshape(-1, 2), axis=0)
     assert clearance(occupied, 0.05, places).min() > radius - 0.0354
 
 
 def test_no_step_of_a_whole_episode_crosses_an_obstacle(
-    any_drive: tuple[BOOLS, float, Drive],
+    any_rollout: tuple[BOOLS, float, Rollout],
 ) -> None:
-    occupied, _, run = any_drive
+    occupied, _, run = any_rollout
     poses = run.poses.astype(np.float64)
     x, y = poses[:, :-1, 0].ravel(), poses[:, :-1, 1].ravel()
     d_x, d_y = np.diff(poses[..., 0]).ravel(), np.diff(poses[..., 1]).ravel()
@@ -86,9 +86,9 @@ def test_no_step_of_a_whole_episode_crosses_an_obstacle(
 
 
 def test_episodes_meet_walls_and_refused_moves_do_not_move_the_robot(
-    any_drive: tuple[BOOLS, float, Drive],
+    any_rollout: tuple[BOOLS, float, Rollout],
 ) -> None:
-    _, _, run = any_drive
+    _, _, run = any_rollout
     refused = run.info["collision"]
     assert refused.mean() > 0.01
     still = np.all(run.poses[:, 1:, :2] == run.poses[:, :-1, :2], axis=-1)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from driving import Drive, drive
 from grid_oracle import clearance, open_map, wrap_map
+from rollouts import Rollout, run_robots
 from scipy import ndimage
 
 import sqn_jax
@@ -73,14 +73,16 @@ def test_a_step_returns_six_values_with_the_documented_types(
     assert new_state.step == state.step + 1 == 1
 
 
-def test_an_episode_is_never_terminated_and_truncated_at_its_last_step(maze_drive: Drive) -> None:
-    assert not maze_drive.terminated.any()
-    assert not maze_drive.truncated[:, :399].any()
-    assert maze_drive.truncated[:, 399].all()
+def test_an_episode_is_never_terminated_and_truncated_at_its_last_step(
+    maze_rollout: Rollout,
+) -> None:
+    assert not maze_rollout.terminated.any()
+    assert not maze_rollout.truncated[:, :399].any()
+    assert maze_rollout.truncated[:, 399].all()
 
 
 def test_reaching_the_goal_ends_nothing(hall_params: EnvParams) -> None:
-    run = drive(hall_params.replace(goal_radius=jnp.float32(100.0)), seed=0, robots=16)
+    run = run_robots(hall_params.replace(goal_radius=jnp.float32(100.0)), seed=0, robots=16)
     assert run.info["reached"].all()
     assert not run.terminated.any()
     assert not run.truncated[:, :399].any()
@@ -175,11 +177,11 @@ def test_a_start_given_is_the_start(maze_params: EnvParams) -> None:
 
 
 def test_the_same_key_gives_the_same_episode_and_another_key_another(
-    maze_params: EnvParams, maze_drive: Drive
+    maze_params: EnvParams, maze_rollout: Rollout
 ) -> None:
-    assert_same(drive(maze_params, seed=0, robots=16), maze_drive)
-    other = drive(maze_params, seed=1, robots=16)
-    assert not np.any(np.all(other.poses[:, 0] == maze_drive.poses[:, 0], axis=-1))
+    assert_same(run_robots(maze_params, seed=0, robots=16), maze_rollout)
+    other = run_robots(maze_params, seed=1, robots=16)
+    assert not np.any(np.all(other.poses[:, 0] == maze_rollout.poses[:, 0], axis=-1))
 
 
 def test_robots_under_vmap_do_what_single_robots_do_bit_for_bit(

@@ -25,6 +25,6 @@ def test_the_share_of_tasks_with_a_near_goal_is_as_asked(share: float) -> None:
     # How many lie within 5.25 m at random is read off the same map with a share of 0.
     plain = make_env("maze", EnvConfig())
     plain_poses, plain_goals = jax.jit(jax.vmap(sample_task, in_axes=(0, None)))(keys, plain)
-    by_chance = (np.hypot(*np.asarray(plain_poses[:, :2] - plain_goals).T) < 5.25).mean()
-    expected = share + (1 - share) * by_chance
+    at_random = (np.hypot(*np.asarray(plain_poses[:, :2] - plain_goals).T) < 5.25).mean()
+    expected = share + (1 - share) * at_random
     assert near.mean() == pytest.approx(expected, abs=0.035)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from driving import Drive
 from grid_oracle import open_map, wrap_map
+from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
@@ -48,9 +48,9 @@ def many_steps(pose, action, params):
 
 
 def test_every_number_of_whole_episodes_lies_in_zero_to_one(
-    maze_drive: Drive, hall_drive: Drive
+    maze_rollout: Rollout, hall_rollout: Rollout
 ) -> None:
-    for run in (maze_drive, hall_drive):
+    for run in (maze_rollout, hall_rollout):
         for leaf, size in ((run.observations.ranges, 71), (run.observations.goal, 2)):
             assert leaf.shape[-1] == size
             assert leaf.dtype == np.float32

@@ -111,7 +111,7 @@ def test_the_mirrored_half_lives_on_the_map_turned_over(maze: EnvParams) -> None
     there_goal = jnp.asarray(over(np.asarray(goal)), jnp.float32)
     actions = jax.random.randint(keys[0], (20, COUNT), 0, navigation.NUM_ACTIONS)
 
-    def drive(params: EnvParams, pose: jax.Array, goal: jax.Array, axes: object) -> Any:
+    def run_robots(params: EnvParams, pose: jax.Array, goal: jax.Array, axes: object) -> Any:
         reset = jax.vmap(navigation.reset_to, in_axes=(0, 0, 0, axes))
         one = jax.vmap(navigation.step, in_axes=(0, 0, 0, axes))
 
@@ -122,9 +122,9 @@ def test_the_mirrored_half_lives_on_the_map_turned_over(maze: EnvParams) -> None
         return jax.lax.scan(step, reset(keys, pose, goal, params)[1], actions)[1]
 
     with compiling_quickly():
-        mirrored = jax.jit(lambda: drive(worlds, pose, goal, axes))()
-        here = jax.jit(lambda: drive(maze, pose, goal, None))()
-        there = jax.jit(lambda: drive(turned, there_pose, there_goal, None))()
+        mirrored = jax.jit(lambda: run_robots(worlds, pose, goal, axes))()
+        here = jax.jit(lambda: run_robots(maze, pose, goal, None))()
+        there = jax.jit(lambda: run_robots(turned, there_pose, there_goal, None))()
     assert there[2].any()
     for side, other in ((~odd, here), (odd, there)):
         for seen, expected in zip(mirrored, other, strict=True):

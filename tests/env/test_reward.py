@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from driving import Drive
 from grid_oracle import BEAMS, BOOLS, FIELD_OF_VIEW, open_map, scan, seen_areas, wrap_map
+from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
@@ -192,13 +192,13 @@ def test_the_weights_come_from_the_config(walled: BOOLS, walled_params: EnvParam
 
 
 def test_the_rewards_of_whole_episodes_are_the_weighted_sums_of_their_terms(
-    maze_drive: Drive,
+    maze_rollout: Rollout,
 ) -> None:
-    info = {name: value.astype(np.float64) for name, value in maze_drive.info.items()}
+    info = {name: value.astype(np.float64) for name, value in maze_rollout.info.items()}
     expected = 2.0 * info["reward_navigation"] + info["covered_area"] - 0.2
-    np.testing.assert_allclose(maze_drive.rewards, expected, atol=1e-5)
+    np.testing.assert_allclose(maze_rollout.rewards, expected, atol=1e-5)
     np.testing.assert_array_equal(info["reward_exploration"], info["covered_area"])
-    distance = np.hypot(*(maze_drive.poses[:, 1:, :2] - maze_drive.goals[:, None]).T).T
+    distance = np.hypot(*(maze_rollout.poses[:, 1:, :2] - maze_rollout.goals[:, None]).T).T
     np.testing.assert_allclose(info["goal_distance"], distance, atol=1e-5)
     # Away from the goal's circle by more than rounding, `reached` is the comparison.
     sure = np.abs(distance - 0.3) > 1e-4

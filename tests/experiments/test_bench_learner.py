@@ -16,7 +16,7 @@ import pytest
 from compiling import compiling_quickly
 
 from experiments import operations
-from sqn_jax.agent import Trajectory, gru, linear, make_network, networks, r2d2, replay
+from sqn_jax.agent import Trajectory, make_network, r2d2, replay
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.loss import r2d2_loss
 from sqn_jax.agent.program import Program
@@ -227,30 +227,11 @@ def operations_in(jaxpr: Any) -> int:
     return total
 
 
-def as_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Layers with inputs of their own one by one, and layers in a row one after the other."""
-
-    def apart(inputs: Any, layers: Any) -> Any:
-        *ends, _ = np.cumsum([layer.kernel.shape[0] for layer in layers])
-        pieces = zip(jnp.split(inputs, ends, axis=-1), layers, strict=True)
-        return jnp.concatenate([linear.affine(x, *layer) for x, layer in pieces], axis=-1)
-
-    def one_by_one(branches: Any, following: Any) -> Any:
-        return linear.affine(branches.outputs(), *following)
-
-    for module in (linear, networks):
-        monkeypatch.setattr(module, "apply_each", apart)
-    for module in (gru, networks):
-        monkeypatch.setattr(module, "then", one_by_one)
-
-
 @pytest.mark.parametrize("algo", ["sqn", "r2d2", "dqn"])
 @pytest.mark.parametrize("burn_in_length", [0, 3])
 def test_operations_of_an_update_are_those_of_the_traced_program(
-    algo: Any, burn_in_length: int, monkeypatch: pytest.MonkeyPatch
+    algo: Any, burn_in_length: int
 ) -> None:
-    """Of the network as it is written: layer by layer, even where two become one."""
-    as_written(monkeypatch)
     config = dataclasses.replace(LEARNER, burn_in_length=burn_in_length)
     rng = np.random.default_rng(6)
     episodes, weights = random_batch(rng)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import check_texts, drawn, marks, panels, ways
+from drawing import check_texts, drawn, drawn_paths, marks, panels
 from episodes import changed, episode, walled_room
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
@@ -25,7 +25,7 @@ def test_a_path_has_the_weights_of_its_steps_until_the_goal() -> None:
     one = episode(arrival=12)
     figure = drawn(figures.skill_trajectories([one], title="SQN"))
     (axes,) = panels(figure)
-    (path,) = ways(axes)
+    (path,) = drawn_paths(axes)
     segments = np.array(path.get_segments())
     np.testing.assert_allclose(segments[:, 0], one.poses[:12, :2])
     np.testing.assert_allclose(segments[:, 1], one.poses[1:13, :2])
@@ -39,7 +39,7 @@ def test_a_path_has_the_weights_of_its_steps_until_the_goal() -> None:
 def test_a_failed_path_is_whole_and_ends_in_a_cross() -> None:
     one = episode(arrival=0)
     (axes,) = panels(figures.skill_trajectories([one], title="SQN"))
-    assert len(ways(axes)[0].get_segments()) == 30
+    assert len(drawn_paths(axes)[0].get_segments()) == 30
     np.testing.assert_allclose(marks(axes, "x"), one.poses[-1:, :2])
     assert axes.get_title() == "room: 0 of 1 reached"
 
@@ -48,7 +48,7 @@ def test_the_scale_has_two_ends_with_a_light_middle_and_paths_a_dark_edge() -> N
     """The ends are the colours that the skills have elsewhere; all is to be seen on the ground."""
     one = episode()
     (axes,) = panels(figures.skill_trajectories([one], title="SQN"))
-    (path,) = ways(axes)
+    (path,) = drawn_paths(axes)
     colours = path.get_cmap()(np.linspace(0, 1, 255))[:, :3]
     np.testing.assert_allclose(colours[0], to_rgb(style.COLORS[1]), atol=0.01)
     np.testing.assert_allclose(colours[-1], to_rgb(style.COLORS[0]), atol=0.01)
@@ -67,7 +67,7 @@ def test_more_than_two_skills_have_the_colour_of_the_largest_weight() -> None:
     (axes,) = figure.axes  # and no scale
     expected = [to_rgb(style.COLORS[int(np.argmax(w))]) for w in one.skill_weights[:12]]
     assert len(set(expected)) == 3
-    assert [to_rgb(colour) for colour in ways(axes)[0].get_colors()] == expected
+    assert [to_rgb(colour) for colour in drawn_paths(axes)[0].get_colors()] == expected
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names[-3:] == ["mostly skill 1", "mostly skill 2", "mostly skill 3"]
 
@@ -75,7 +75,7 @@ def test_more_than_two_skills_have_the_colour_of_the_largest_weight() -> None:
 def test_agents_without_skills_have_one_colour_that_is_no_skills() -> None:
     figure = figures.skill_trajectories([episode(skills=1)], title="R2D2")
     (axes,) = figure.axes
-    (colour,) = {to_rgb(colour) for colour in ways(axes)[0].get_colors()}
+    (colour,) = {to_rgb(colour) for colour in drawn_paths(axes)[0].get_colors()}
     assert colour not in {to_rgb(skill) for skill in style.COLORS[:2]}
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["start", "goal", "agent without skills"]
@@ -98,7 +98,7 @@ def test_each_map_has_a_panel_with_its_own_episodes() -> None:
         "room: 2 of 2 reached",
         "another: 0 of 1 reached",
     ]
-    assert [len(ways(axes)) for axes in panels(figure)] == [2, 1]
+    assert [len(drawn_paths(axes)) for axes in panels(figure)] == [2, 1]
     for axes, room in zip(panels(figure), (walled_room(), other_room()), strict=True):
         np.testing.assert_array_equal(axes.images[0].get_array(), room.occupied)
     with pytest.raises(ValueError, match="no episodes"):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from drawing import check_texts, drawn, marks, panels, ways
+from drawing import check_texts, drawn, drawn_paths, marks, panels
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle
 
@@ -52,7 +52,7 @@ def draw(data, **options):
 
 def start_order(axes):
     """Which episodes a panel draws, read off their starts."""
-    return [round(100 * (path.get_segments()[0][0][0] - 1.0)) for path in ways(axes)]
+    return [round(100 * (path.get_segments()[0][0][0] - 1.0)) for path in drawn_paths(axes)]
 
 
 def colorbar_labels(figure):
@@ -62,7 +62,7 @@ def colorbar_labels(figure):
 def test_a_success_is_drawn_from_its_start_to_its_first_entry():
     data = episodes(GOALS[:1], [True], [12])
     (axes,) = panels(draw(data))
-    (path,) = ways(axes)
+    (path,) = drawn_paths(axes)
     segments = np.array(path.get_segments())
     assert segments.shape == (12, 2, 2)
     # The start is where the robot stood, step 12 ends in pose 12, and no piece is missing.
@@ -77,7 +77,7 @@ def test_a_failure_is_drawn_whole_and_ends_in_a_cross():
     data = episodes(GOALS[:1], [False], [30])
     figure = draw(data)
     (axes,) = panels(figure)
-    (path,) = ways(axes)
+    (path,) = drawn_paths(axes)
     assert len(path.get_segments()) == 30
     np.testing.assert_allclose(marks(axes, "x"), data["poses"][-1:, 0, :2])
     assert "not reached" in [text.get_text() for text in figure.legends[0].get_texts()]
@@ -90,9 +90,9 @@ def test_the_colour_of_a_step_is_the_weight_of_the_first_skill():
     figure = draw(data)
     assert any("weight of skill 1" in label for label in colorbar_labels(figure))
     (axes,) = panels(figure)
-    for path in ways(axes):
+    for path in drawn_paths(axes):
         assert (path.norm.vmin, path.norm.vmax) == (0.0, 1.0)
-    lengths = {len(path.get_array()): path.get_array() for path in ways(axes)}
+    lengths = {len(path.get_array()): path.get_array() for path in drawn_paths(axes)}
     np.testing.assert_allclose(lengths[12], data["skill_weights"][:12, 0, 0])
     np.testing.assert_allclose(lengths[30], data["skill_weights"][:, 1, 0])
 
@@ -100,7 +100,7 @@ def test_the_colour_of_a_step_is_the_weight_of_the_first_skill():
 def test_the_ends_of_the_weight_scale_differ_in_brightness():
     """So that the picture survives greyscale (luma, Rec. 601)."""
     figure = draw(episodes(GOALS[:1], [True], [12]))
-    colours = ways(panels(figure)[0])[0].get_cmap()(np.linspace(0, 1, 32))[:, :3]
+    colours = drawn_paths(panels(figure)[0])[0].get_cmap()(np.linspace(0, 1, 32))[:, :3]
     luma = colours @ [0.299, 0.587, 0.114]
     assert (np.diff(luma) < 0).all()
     assert luma[0] - luma[-1] > 0.4
@@ -110,9 +110,9 @@ def test_the_ends_of_the_weight_scale_differ_in_brightness():
 def test_one_skill_has_one_colour_and_no_scale_for_it():
     figure = draw(episodes(GOALS[:1] * 2, [True, False], [12, 30], skills=1))
     assert colorbar_labels(figure) == {"distance to the goal, m"}
-    drawn_paths = [path for axes in panels(figure) for path in ways(axes)]
-    assert all(path.get_array() is None for path in drawn_paths)
-    assert len({to_rgb(colour) for path in drawn_paths for colour in path.get_colors()}) == 1
+    all_paths = [path for axes in panels(figure) for path in drawn_paths(axes)]
+    assert all(path.get_array() is None for path in all_paths)
+    assert len({to_rgb(colour) for path in all_paths for colour in path.get_colors()}) == 1
 
 
 def test_titles_count_all_episodes_and_average_the_steps_of_the_successes():
@@ -164,7 +164,7 @@ def test_goals_within_a_micrometre_share_a_panel():
     x, y = GOALS[0]
     goals = [(x, y), (x + 5e-7, y), (x + 1e-3, y)]
     figure = draw(episodes(goals, [True] * 3, [5] * 3))
-    assert [len(ways(axes)) for axes in panels(figure)] == [2, 1]
+    assert [len(drawn_paths(axes)) for axes in panels(figure)] == [2, 1]
 
 
 def test_a_crowded_panel_draws_failures_first_then_successes_from_quick_to_slow():
@@ -185,7 +185,7 @@ def test_eight_paths_are_drawn_and_failures_leave_room_for_successes(failures, f
     success = np.arange(20) >= failures
     figure = draw(episodes(GOALS[:1] * 20, success, np.where(success, 9, 30)))
     (axes,) = panels(figure)
-    assert len(ways(axes)) == 8
+    assert len(drawn_paths(axes)) == 8
     assert len(marks(axes, "x")) == failed_drawn
 
 

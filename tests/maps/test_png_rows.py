@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sqn_jax.maps import load_map
-from sqn_jax.maps.image import GreyImage, read_pixels
+from sqn_jax.maps.image import GrayImage, read_pixels
 
 # The order in which an interlaced image is sent, in squares of 8 x 8 pixels, by the standard.
 ADAM7 = """
@@ -60,17 +60,17 @@ def interlaced(pixels: np.ndarray, depth: int) -> bytes:
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[[bytes], GreyImage]:
+def read(tmp_path: Path) -> Callable[[bytes], GrayImage]:
     """Decode an image out of a file."""
 
-    def read(data: bytes) -> GreyImage:
+    def read(data: bytes) -> GrayImage:
         (tmp_path / "image").write_bytes(data)
         return read_pixels(tmp_path / "image", "trinary")
 
     return read
 
 
-Read = Callable[[bytes], GreyImage]
+Read = Callable[[bytes], GrayImage]
 TRUNCATED = "image file is truncated"
 MISSING = "rows of pixels are missing"
 

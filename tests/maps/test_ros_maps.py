@@ -218,11 +218,11 @@ def test_a_comment_in_a_binary_pgm_is_skipped(room: Room) -> None:
 
 def test_unknown_ground_that_reads_as_free_is_warned_about(room: Room) -> None:
     path = room(grey=blocks(254, 254, 205), free_thresh="0.25")
-    with pytest.warns(UserWarning, match=r"room\.yaml: grey 205 of 255 .* fills 33% ") as caught:
+    with pytest.warns(UserWarning, match=r"room\.yaml: gray 205 of 255 .* fills 33% ") as caught:
         loaded = load_map(path)
     assert [str(warning.message) for warning in caught] == list(loaded.warnings)
     # A third of the ground in a shade that no program writes for unknown is as suspicious ...
-    with pytest.warns(UserWarning, match="grey 200 of 255"):
+    with pytest.warns(UserWarning, match="gray 200 of 255"):
         load_map(room(grey=blocks(254, 254, 200), free_thresh="0.25"))
 
 

@@ -151,12 +151,13 @@ def test_a_missing_library_is_one_line_with_the_name_of_the_extra(
     extra: str,
 ) -> None:
     import sqn_jax
+    from sqn_jax import report
 
     ours = ("sqn_jax.report.render", "sqn_jax.figures")
     for module in [name for name in sys.modules if name.startswith((*ours, f"{missing}."))]:
         monkeypatch.delitem(sys.modules, module)
-    for name in ("render", "figures"):
-        monkeypatch.delattr(sqn_jax, name, raising=False)
+    monkeypatch.delattr(report, "render", raising=False)
+    monkeypatch.delattr(sqn_jax, "figures", raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
     assert main(["render", "pretrained:one", "--mp4"]) == 2
     told = capsys.readouterr().err

@@ -24,6 +24,8 @@ def learner(*numbers: float) -> LearnerState:
         params={"a": {"kernel": jnp.ones((2, 2))}, "b": jnp.array(numbers)},
         target_params=None,
         opt_state={"mu": jnp.zeros(3)},
+        memory=None,
+        round=jnp.int32(7),
         num_updates=jnp.int32(10),
         num_skipped=jnp.int32(0),
     )

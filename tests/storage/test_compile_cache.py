@@ -25,7 +25,7 @@ from rooms import write_empty_room
 
 from sqn_jax.cli import main
 from sqn_jax.storage import compile_cache
-from sqn_jax.storage.compile_cache import kept_programs, watched_compilation
+from sqn_jax.storage.compile_cache import cached_programs, watched_compilation
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def mode_of(path: Path) -> int:
 
 def refused(capsys: pytest.CaptureFixture[str]) -> str:
     """The one line that tells why there is no cache."""
-    with kept_programs():
+    with cached_programs():
         assert cache_dir() is None
     told = capsys.readouterr().err
     assert told.startswith("compiled programs are not kept: ")
@@ -81,7 +81,7 @@ def test_programs_are_kept_in_the_users_cache_folder_for_him_alone(
     expected = tmp_path / where / "sqn_jax" / "compiled"
     mask = os.umask(0)
     try:
-        with kept_programs():
+        with cached_programs():
             assert cache_dir() == str(expected)
     finally:
         os.umask(mask)
@@ -96,7 +96,7 @@ def test_the_switch_leaves_nothing_behind(
     monkeypatch.setenv("SQN_JAX_CACHE", word)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    with kept_programs():
+    with cached_programs():
         assert cache_dir() is None
     assert list(tmp_path.iterdir()) == []
 
@@ -105,7 +105,7 @@ def test_a_cache_the_user_set_up_for_jax_is_left_alone(tmp_path: Path, folder: P
     own = str(tmp_path / "own")
     jax.config.update("jax_compilation_cache_dir", own)
     try:
-        with kept_programs():
+        with cached_programs():
             assert cache_dir() == own
         assert cache_dir() == own
     finally:
@@ -148,7 +148,7 @@ def test_nor_may_others_be_able_to_put_another_in_its_place(
     shared.chmod(0o777)
     assert f"others may write to {shared}\n" in refused(capsys)
     shared.chmod(0o1777)  # As /tmp is.
-    with kept_programs():
+    with cached_programs():
         assert cache_dir() == str(shared / "mine" / "kept")
 
 
@@ -204,7 +204,7 @@ def run_program(shift: float) -> tuple[Array, bool]:
 @pytest.fixture
 def filled(folder: Path) -> Path:
     """The folder with two programs in it."""
-    with kept_programs():
+    with cached_programs():
         for shift in (1.0, 2.0):
             result, was_read = run_program(shift)
             assert not was_read
@@ -221,7 +221,7 @@ def test_a_program_is_read_the_second_time(
     filled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path: path.read_bytes() for path in filled.iterdir()}
-    with kept_programs():
+    with cached_programs():
         for shift in (1.0, 2.0):
             result, was_read = run_program(shift)
             assert was_read
@@ -252,7 +252,7 @@ def test_a_damaged_program_is_compiled_again(
         damaged = [whole[path] for path in reversed(ours)]
     for path, content in zip(ours, damaged, strict=True):
         path.write_bytes(content)
-    with kept_programs():
+    with cached_programs():
         for shift in (1.0, 2.0):
             result, was_read = run_program(shift)
             assert not was_read
@@ -260,7 +260,7 @@ def test_a_damaged_program_is_compiled_again(
     told = capsys.readouterr().err
     assert f"{filled}: {len(ours)} damaged" in told
     assert told.count("\n") == 1
-    with kept_programs():
+    with cached_programs():
         assert run_program(1.0)[1]
     assert capsys.readouterr().err == ""
 
@@ -268,7 +268,7 @@ def test_a_damaged_program_is_compiled_again(
 def test_an_entry_damaged_under_way_is_told_of_and_replaced(
     filled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with kept_programs():
+    with cached_programs():
         for path in entries(filled):
             path.write_bytes(path.read_bytes()[:50])
         for shift in (1.0, 2.0):
@@ -276,7 +276,7 @@ def test_an_entry_damaged_under_way_is_told_of_and_replaced(
     told = capsys.readouterr().err
     assert f"compiled programs in {filled}: reading jit_" in told
     assert told.count("\n") == 1
-    with kept_programs():
+    with cached_programs():
         assert all(run_program(shift)[1] for shift in (1.0, 2.0))
 
 
@@ -285,7 +285,7 @@ def test_an_unfinished_entry_is_deleted_without_a_word(
 ) -> None:
     for path in filled.glob("*-sha256"):
         path.unlink()
-    with kept_programs():
+    with cached_programs():
         assert entries(filled) == []
     assert capsys.readouterr().err == ""
 
@@ -294,7 +294,7 @@ def test_a_full_disk_is_told_of_once_and_leaves_no_pieces(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with kept_programs():
+    with cached_programs():
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))
         try:
             for shift in (1.0, 2.0):
@@ -311,7 +311,7 @@ def test_a_full_disk_is_told_of_once_and_leaves_no_pieces(
 def test_a_folder_deleted_under_way_stops_nothing(
     filled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with kept_programs():
+    with cached_programs():
         assert run_program(1.0)[1]
         shutil.rmtree(filled)
         np.testing.assert_array_equal(run_program(3.0)[0], expected(3.0))
@@ -328,7 +328,7 @@ def test_the_oldest_are_deleted_when_the_folder_is_full(
         os.utime(path, (1e9, 1e9))
     os.utime(new, (2e9, 2e9))
     monkeypatch.setattr(compile_cache, "LARGEST_BYTES", new.stat().st_size)
-    with kept_programs():
+    with cached_programs():
         assert entries(filled) == [new]
 
 

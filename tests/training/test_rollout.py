@@ -253,7 +253,7 @@ def random_trajectory(rng: np.random.Generator, length: int, robots: int) -> Tra
 
 def test_metrics_are_those_counted_in_a_loop() -> None:
     length, robots, radius = 9, 40, 0.1
-    trajectory = random_trajectory(np.random.default_rng(1), length, robots)
+    trajectory = jax.device_get(random_trajectory(np.random.default_rng(2), length, robots))
     metrics = episode_metrics(trajectory, jnp.float32(radius))
     info, poses = trajectory.info, np.asarray(trajectory.poses)
     first_entries = []

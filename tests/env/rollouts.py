@@ -15,7 +15,7 @@ from sqn_jax.env import EnvParams, EnvState, Observation, reset, step
 TURN_LEFT, TURN_RIGHT = 3, 4
 
 
-class Drive(NamedTuple):
+class Rollout(NamedTuple):
     """What N robots did in T steps; poses and coverage have the start in front."""
 
     poses: np.ndarray  # [N, T + 1, 3]
@@ -29,24 +29,24 @@ class Drive(NamedTuple):
     observations: Observation  # [N, T + 1, ...]
 
 
-def drive(params: EnvParams, seed: int, robots: int, num_steps: int = 400) -> Drive:
+def run_robots(params: EnvParams, seed: int, robots: int, num_steps: int = 400) -> Rollout:
     """Let the first half of the robots act at random and the others wander about."""
     keys = jax.random.split(jax.random.key(seed), robots)
-    return _drive(keys, jnp.arange(robots) >= robots // 2, params, num_steps)
+    return _run_robots(keys, jnp.arange(robots) >= robots // 2, params, num_steps)
 
 
-def _drive(keys: Array, wanders: Array, params: EnvParams, num_steps: int) -> Drive:
+def _run_robots(keys: Array, wanders: Array, params: EnvParams, num_steps: int) -> Rollout:
     run = _episodes(keys, wanders, params, num_steps=num_steps)
     return jax.tree.map(np.asarray, run)
 
 
 @partial(jax.jit, static_argnames="num_steps")
-def _episodes(keys: Array, wanders: Array, params: EnvParams, *, num_steps: int) -> Drive:
+def _episodes(keys: Array, wanders: Array, params: EnvParams, *, num_steps: int) -> Rollout:
     return jax.vmap(partial(_episode, params=params, num_steps=num_steps))(keys, wanders)
 
 
-def _episode(key: Array, wanders: Array, *, params: EnvParams, num_steps: int) -> Drive:
-    reset_key, drive_key = jax.random.split(key)
+def _episode(key: Array, wanders: Array, *, params: EnvParams, num_steps: int) -> Rollout:
+    reset_key, rollout_key = jax.random.split(key)
     obs, state = reset(reset_key, params)
 
     def one_step(
@@ -62,7 +62,7 @@ def _episode(key: Array, wanders: Array, *, params: EnvParams, num_steps: int) -
         result = step(step_key, state, action, params)
         return (result[0], result[1], action), (action, *result)
 
-    keys = jax.random.split(drive_key, num_steps)
+    keys = jax.random.split(rollout_key, num_steps)
     _, (actions, later_obs, states, rewards, terminated, truncated, info) = jax.lax.scan(
         one_step, (obs, state, jnp.int32(0)), keys
     )
@@ -70,7 +70,7 @@ def _episode(key: Array, wanders: Array, *, params: EnvParams, num_steps: int) -
     all_obs, all_states = jax.tree.map(
         lambda first, later: jnp.concatenate([first, later]), start, (later_obs, states)
     )
-    return Drive(
+    return Rollout(
         poses=all_states.pose,
         goals=state.goal,
         covered=all_states.covered,
