@@ -1,7 +1,7 @@
-"""Pictures of recorded data, one function each: from NumPy arrays or rows to a Matplotlib figure.
+"""Figures of recorded data: each function takes arrays or rows and returns a Matplotlib figure.
 
-No pyplot, no display, no global state: a figure belongs to nobody until `save` writes it as PNG or
-`picture` hands it to a notebook. Films are drawn by `frames`, `gif` and `mp4`.
+No pyplot, no display, no global state. `save` writes a figure as PNG, `picture` shows it in a
+notebook. Animations are made by `frames`, `gif` and `mp4`.
 """
 
 from sqn_jax.figures.animation import frames, gif, mp4

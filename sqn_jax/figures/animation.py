@@ -1,7 +1,8 @@
-"""An episode as a film: the map as the robot gets to know it, its own view, skills and reward.
+"""Animations of an episode: the map as the robot sees it, its own view, skills and reward.
 
-What does not change is drawn once and kept as pixels. A frame is a copy of them into Matplotlib's
-canvas, the map panel colored directly, pixel by pixel, and the few artists that move drawn on top.
+The constant background is drawn once and stored as pixels. For a frame these are copied into the
+canvas of Matplotlib, the pixels of the map panel are set directly, and the few moving artists are
+drawn on top.
 """
 
 from __future__ import annotations
@@ -24,29 +25,29 @@ from sqn_jax.storage.files import written_whole
 Frame = NDArray[np.uint8]
 
 LAST_FRAME_MS = 1_000
-"""How long the last frame stands, so that the end is seen before a GIF starts anew."""
+"""Duration of the last frame, so that the end can be seen before a GIF repeats."""
 
 PALETTE_FRAMES = 8
-"""Frames that the palette of a GIF is made from."""
+"""Number of frames from which the palette of a GIF is made."""
 
 UNCHANGED = 255
-"""The last of a GIF's 256 colors is transparent: there the frame before shows through. What does
-not change takes hardly any room so."""
+"""The last of the 256 colors of a GIF is transparent and shows the frame before, so that unchanged
+pixels take hardly any space."""
 
 
 def frames(episode: Episode, *, count: int = 240, width_px: int = 800) -> Iterator[Frame]:
-    """Draw a film of an episode, from its start until 2 s after the arrival.
+    """Draw an animation of an episode, from its start until 2 s after the arrival.
 
-    Without success the whole episode is shown. The frames are evenly spaced steps, all of them
-    where there are no more than `count`.
+    Without success the whole episode is shown. The frames are evenly spaced steps, or all steps if
+    there are no more than `count`.
 
     Args:
-        episode: what happened.
-        count: frames at most, 2 to 10,000.
-        width_px: width of a frame, 320 to 3,840; its height is in proportion, both are even.
+        episode: the episode.
+        count: the largest number of frames, 2 to 10,000.
+        width_px: width of a frame, 320 to 3,840; the height is proportional; both are even.
 
     Returns:
-        The frames one by one, [h, w, 3] uint8 RGB.
+        An iterator over the frames, [h, w, 3] uint8 RGB.
 
     Raises:
         ValueError: `count` or `width_px` is out of its range.
@@ -57,7 +58,7 @@ def frames(episode: Episode, *, count: int = 240, width_px: int = 800) -> Iterat
 
 
 def shown_steps(episode: Episode, count: int = 240) -> NDArray[np.intp]:
-    """The indices 0..T of the states that a film of at most `count` frames shows.
+    """The indices 0..T of the states in an animation of at most `count` frames.
 
     Raises:
         ValueError: `count` is out of its range.
@@ -71,15 +72,18 @@ def shown_steps(episode: Episode, count: int = 240) -> NDArray[np.intp]:
 def gif(
     episode: Episode, *, count: int = 240, frames_per_second: int = 20, width_px: int = 800
 ) -> bytes:
-    """A film as an animated GIF that repeats; the last frame stands for a second.
+    """An animated GIF that repeats; the last frame is shown for a second.
 
-    All frames share one palette, made from some of them and from the colors that mean something.
+    All frames share one palette, made from some of them and from the colors with a meaning.
 
     Args:
-        episode: what happened.
+        episode: the episode.
         count: see `frames`.
         frames_per_second: 1 to 50; a frame lasts a whole number of hundredths of a second.
         width_px: see `frames`.
+
+    Returns:
+        The GIF file.
 
     Raises:
         ValueError: an option is out of its range.
@@ -87,25 +91,26 @@ def gif(
     _check_rate(frames_per_second)
     steps = shown_steps(episode, count)
     screen = Screen(episode, *frame_size(width_px))
-    some = np.linspace(0, len(steps) - 1, min(PALETTE_FRAMES, len(steps))).round().astype(int)
-    palette = _Palette([screen.draw(int(steps[index])) for index in some])
+    samples = np.linspace(0, len(steps) - 1, min(PALETTE_FRAMES, len(steps))).round().astype(int)
+    palette = _Palette([screen.draw(int(steps[index])) for index in samples])
 
     def images() -> Iterator[Image.Image]:
         before = None
         for step in steps:
-            told = palette.indices(screen.draw(int(step)))
-            fresh = told if before is None else np.where(told == before, UNCHANGED, told)
-            before = told
-            image = Image.fromarray(fresh.astype(np.uint8), "P")
+            indices = palette.indices(screen.draw(int(step)))
+            is_first = before is None
+            shown = indices if is_first else np.where(indices == before, UNCHANGED, indices)
+            before = indices
+            image = Image.fromarray(shown.astype(np.uint8), "P")
             image.putpalette(palette.table.tobytes())
             yield image
 
     first, *others = images()
     duration = 10 * round(100 / frames_per_second)
     durations = [duration] * len(others) + [max(duration, LAST_FRAME_MS)]
-    file = io.BytesIO()
+    buffer = io.BytesIO()
     first.save(
-        file,
+        buffer,
         format="GIF",
         save_all=True,
         append_images=others,
@@ -115,7 +120,7 @@ def gif(
         transparency=UNCHANGED,
         optimize=False,
     )
-    return file.getvalue()
+    return buffer.getvalue()
 
 
 def mp4(
@@ -126,11 +131,11 @@ def mp4(
     frames_per_second: int = 20,
     width_px: int = 800,
 ) -> None:
-    """Write a film as MP4 (H.264), all or nothing; the last frame stands for a second.
+    """Write an animation as MP4 (H.264), all or nothing; the last frame is shown for a second.
 
     Args:
-        path: the file, ending in .mp4, in a folder that exists.
-        episode: what happened.
+        path: the file, ending in .mp4, in an existing folder.
+        episode: the episode.
         count: see `frames`.
         frames_per_second: 1 to 50.
         width_px: see `frames`.
@@ -144,33 +149,33 @@ def mp4(
     _check_rate(frames_per_second)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path}: the name ends in {path.suffix!r}, expected .mp4")
-    film = frames(episode, count=count, width_px=width_px)
+    images = frames(episode, count=count, width_px=width_px)
     width, height = frame_size(width_px)
-    words = f"-loglevel error -y -f rawvideo -pix_fmt rgb24 -s {width}x{height} "
-    words += f"-r {frames_per_second} -i - -an -c:v libx264 -crf 22 -pix_fmt yuv420p"
-    words += " -movflags +faststart"
+    arguments = f"-loglevel error -y -f rawvideo -pix_fmt rgb24 -s {width}x{height} "
+    arguments += f"-r {frames_per_second} -i - -an -c:v libx264 -crf 22 -pix_fmt yuv420p"
+    arguments += " -movflags +faststart"
     with written_whole(path) as partial:
-        # Not by imageio's writer: it forks, which JAX's threads may not survive.
+        # Not with the writer of imageio: it forks, which is unsafe with the threads of JAX.
         with subprocess.Popen(
-            [program, *words.split(), str(partial)],
+            [program, *arguments.split(), str(partial)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
         ) as encoder:
             assert encoder.stdin is not None
             with contextlib.suppress(BrokenPipeError):
-                for frame in film:
+                for frame in images:
                     encoder.stdin.write(frame.tobytes())
                 for _ in range(frames_per_second * LAST_FRAME_MS // 1000 - 1):
                     encoder.stdin.write(frame.tobytes())
-            _, complaint = encoder.communicate()
+            _, stderr = encoder.communicate()
         if encoder.returncode != 0:
-            told = complaint.decode(errors="replace").strip().splitlines() or ["no reason given"]
-            raise ValueError(f"{path}: cannot be written (ffmpeg: {told[-1]})")
+            lines = stderr.decode(errors="replace").strip().splitlines() or ["no reason given"]
+            raise ValueError(f"{path}: cannot be written (ffmpeg: {lines[-1]})")
 
 
 def require_mp4() -> str:
-    """The program that writes MP4.
+    """The path of the program that writes MP4.
 
     Raises:
         ValueError: imageio-ffmpeg is not installed, or has no program for this machine.
@@ -194,7 +199,7 @@ def _check_rate(frames_per_second: int) -> None:
 
 
 def frame_size(width_px: int) -> tuple[int, int]:
-    """Width and height of a frame, pixels, for the width asked for; both even, as MP4 needs them.
+    """Width and height of a frame, pixels, for the requested width; both are even, as MP4 needs.
 
     Raises:
         ValueError: the width is out of its range.
@@ -206,33 +211,33 @@ def frame_size(width_px: int) -> tuple[int, int]:
 
 
 class _Palette:
-    """The colors of a GIF: those that mean something, and others by how often they come.
+    """The colors of a GIF: first those with a meaning, then others by frequency.
 
-    The first ones as they are, since the few pixels of a robot or a goal would not get a place.
+    The few pixels of a robot or a goal would not get a color of the palette by frequency.
     """
 
     def __init__(self, samples: list[Frame]) -> None:
         key_colors = np.unique([rgb(color) for color in KEY_COLORS], axis=0)
         stacked = Image.fromarray(np.concatenate(samples))
         others = stacked.quantize(UNCHANGED - len(key_colors), Image.Quantize.MEDIANCUT)
-        found = np.asarray(others.getpalette(), np.uint8).reshape(-1, 3)
-        table = np.concatenate([key_colors, found])[:UNCHANGED]
+        other_colors = np.asarray(others.getpalette(), np.uint8).reshape(-1, 3)
+        table = np.concatenate([key_colors, other_colors])[:UNCHANGED]
         self._tree = cKDTree(table)
         self.table = np.pad(table, ((0, 256 - len(table)), (0, 0)))
         """[256, 3] uint8."""
-        self._known = np.full(2**24, -1, np.int16)
+        self._cache = np.full(2**24, -1, np.int16)
 
     def indices(self, frame: Frame) -> Frame:
         """[h, w] uint8, the nearest color of the palette for each pixel.
 
-        Not by Pillow, which takes a near one for the nearest. A color is looked for once.
+        Not with Pillow, which does not always find the nearest. The result is cached by color.
         """
         red, green, blue = np.moveaxis(frame.astype(np.int32), -1, 0)
         codes = red << 16 | green << 8 | blue
-        told = self._known[codes]
-        if (told < 0).any():
-            new = np.unique(codes[told < 0])
+        indices = self._cache[codes]
+        if (indices < 0).any():
+            new = np.unique(codes[indices < 0])
             colors = np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1)
-            self._known[new] = self._tree.query(colors)[1]
-            told = self._known[codes]
-        return told.astype(np.uint8)
+            self._cache[new] = self._tree.query(colors)[1]
+            indices = self._cache[codes]
+        return indices.astype(np.uint8)

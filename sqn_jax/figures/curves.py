@@ -1,4 +1,4 @@
-"""How training went: the curves of one run, or of several agents side by side."""
+"""Curves of training: those of one run, or of several agents together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def _metric(rows: Rows, name: str) -> Floats:
-    """A metric as [R, S] (rows, seeds); NaN for None and where a row lacks it."""
+    """A metric as [R, S] (rows, seeds); NaN for None and for rows without it."""
     values = [np.asarray(row.get(name, np.nan), dtype=np.float64) for row in rows]
     shapes = sorted({value.shape for value in values})
     if len(shapes) > 1:
@@ -31,30 +31,30 @@ def _metric(rows: Rows, name: str) -> Floats:
 def _draw_curve(
     axes: Axes, episodes: Floats, values: Floats, color: str, label: str = "", style: str = "-"
 ) -> None:
-    """Draw [R, S]: the mean bold and, if there are several, each seed thin behind it."""
-    # One point makes no line.
+    """Draw the mean of values [R, S] over seeds as a bold line, and several seeds as thin lines."""
+    # A single point would not show as a line.
     marker = "o" if len(episodes) == 1 else ""
-    look: dict[str, Any] = {"color": color, "linestyle": style, "marker": marker}
+    options: dict[str, Any] = {"color": color, "linestyle": style, "marker": marker}
     if values.shape[1] > 1:
-        axes.plot(episodes, values, ms=3, lw=0.8, alpha=0.4, **look)
-    # Masked, since nanmean warns of rows without any number.
+        axes.plot(episodes, values, ms=3, lw=0.8, alpha=0.4, **options)
+    # Masked, because nanmean warns about rows without any number.
     mean = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
-    axes.plot(episodes, mean, ms=5, lw=2.0, label=label, **look)
+    axes.plot(episodes, mean, ms=5, lw=2.0, label=label, **options)
 
 
 def learning_curve(rows: Rows, *, title: str) -> Figure:
-    """Draw how a run learned: reward, success, loss and use of the skills over its episodes.
+    """Plot reward, success, loss and skill weights of a run over its training episodes.
 
     Args:
-        rows: the objects of a run's `metrics.jsonl`, one a chunk. `episodes` (cumulative) is
-            needed; `mean_reward`, `success`, `loss`, `epsilon`, `gate_entropy` (nat) and
-            `wall_seconds` are drawn where present. Each is a number or a list with one a training
-            seed: then every seed is a thin line and their mean a bold one. `skill_usage` is [K],
-            or [seeds, K]. NaN and None leave a gap.
-        title: stands above all panels.
+        rows: the rows of a run's `metrics.jsonl`, one per chunk. `episodes` (cumulative) is
+            required; `mean_reward`, `success`, `loss`, `epsilon`, `gate_entropy` (nat) and
+            `wall_seconds` are drawn if present. Each is a number, or a list of one number per
+            training seed: then each seed is a thin line and their mean a bold one. `skill_usage` is
+            [K] or [seeds, K]. NaN and None leave a gap.
+        title: above all panels.
 
     Returns:
-        Three panels, or four if there is more than one skill.
+        Three panels, or four if there are several skills.
 
     Raises:
         ValueError: no rows, rows without `episodes`, or a metric whose shape changes.
@@ -90,12 +90,12 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
 
 
 def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
-    """Success, with the share of random actions that it suffers from."""
+    """Success, and the fraction of random actions (epsilon) under which it was measured."""
     axes.set_title("success under exploration noise", fontsize=11)
     _draw_curve(axes, episodes, success, COLORS[2], "success")
     if np.isfinite(epsilon).any():
         _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
-    _finish_shares(axes)
+    _finish_fractions(axes)
 
 
 def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
@@ -109,20 +109,20 @@ def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
 
 
 def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -> None:
-    """Mean weight of each skill [R, S, K], and the entropy [R, S] as a share of its maximum."""
+    """Mean weight of each skill [R, S, K], and the entropy [R, S] as a fraction of its maximum."""
     axes.set_title("weight of the skills", fontsize=11)
     skills = usage.shape[2]
     for skill in range(skills):
         color = COLORS[skill % len(COLORS)]
         _draw_curve(axes, episodes, usage[..., skill], color, f"skill {skill + 1}")
     if np.isfinite(entropy).any():
-        share = entropy / math.log(skills)
-        _draw_curve(axes, episodes, share, INK, f"gate entropy / log {skills}", ":")
-    _finish_shares(axes)
+        fraction = entropy / math.log(skills)
+        _draw_curve(axes, episodes, fraction, INK, f"gate entropy / log {skills}", ":")
+    _finish_fractions(axes)
 
 
-def _finish_shares(axes: Axes) -> None:
-    """A scale from 0 to 1, with room above it for the legend."""
+def _finish_fractions(axes: Axes) -> None:
+    """A scale from 0 to 1, with space above for the legend."""
     entries = len(axes.get_legend_handles_labels()[0])
     axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(entries / 3))
     axes.set_yticks(np.linspace(0, 1, 6))
@@ -130,37 +130,37 @@ def _finish_shares(axes: Axes) -> None:
 
 
 def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
-    """A second scale at the top: minutes of wall-clock time, where the rows know it."""
-    known = np.isfinite(wall_seconds)
-    if not known.any():
+    """A second scale at the top: minutes of wall-clock time, if the rows have it."""
+    is_known = np.isfinite(wall_seconds)
+    if not is_known.any():
         return
-    # A resumed run may start its clock anew; a scale must not turn back.
-    minutes = np.maximum.accumulate(wall_seconds[known]) / 60
+    # The clock of a resumed run may restart, but a scale must not decrease.
+    minutes = np.maximum.accumulate(wall_seconds[is_known]) / 60
     ticks: Any = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(minutes[0], minutes[-1])
     ticks = ticks[(ticks >= minutes[0]) & (ticks <= minutes[-1])]
     if ticks.size < 2:
         ticks = minutes[-1:]
-    places = np.interp(ticks, minutes, episodes[known])
+    positions = np.interp(ticks, minutes, episodes[is_known])
     top = axes.secondary_xaxis("top")
-    top.set_xticks(places, [f"{tick:.3g}" for tick in ticks], fontsize=9)
+    top.set_xticks(positions, [f"{tick:.3g}" for tick in ticks], fontsize=9)
     top.tick_params(color="0.5", labelcolor="0.35")
     top.set_xlabel("minutes", fontsize=9, color="0.35")
 
 
 def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure:
-    """Mean reward and success of training over the episodes, one line an agent.
+    """Plot mean reward and success over the training episodes, one line per agent.
 
     Args:
-        runs: for each agent the `metrics.jsonl` rows of its runs; `mean_reward` and `success` are
-            numbers, or lists with one a training seed. Runs of an agent are cut to the shortest.
-        title: stands above both panels.
+        runs: for each agent, the rows of `metrics.jsonl` of its runs; `mean_reward` and `success`
+            are numbers, or lists of one per training seed. Runs are cut to the agent's shortest.
+        title: above both panels.
 
     Returns:
-        Two panels. The line is the mean over an agent's training seeds, the band a 95 % bootstrap
-        interval of it; with one seed there is no band.
+        Two panels. The line is the mean over the training seeds of an agent, the band its 95 %
+        bootstrap interval; with one seed there is no band.
 
     Raises:
-        ValueError: there are no agents, or one has no rows.
+        ValueError: no agents, or an agent without rows.
     """
     if not runs:
         raise ValueError("no runs, expected at least one agent")
@@ -188,7 +188,7 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
 def _draw_band(
     axes: Axes, episodes: NDArray[Any], values: NDArray[Any], color: str, label: str
 ) -> None:
-    """Mean of values [R, S] over the seeds, and its interval where there are several."""
+    """Draw the mean of values [R, S] over seeds; with several seeds, also its interval."""
     axes.plot(episodes, values.mean(axis=1), color=color, lw=2, label=label)
     if values.shape[1] > 1:
         low, high = np.array([bootstrap_interval(row, resamples=400) for row in values]).T
@@ -196,29 +196,29 @@ def _draw_band(
 
 
 def gate_entropy_curves(rows_by_run: Mapping[str, Rows], *, title: str) -> Figure:
-    """Draw how decided the skill decision became in training, and how different the skills.
+    """Plot the entropy of the skill decision in training, and how different the skills are.
 
     Args:
-        rows_by_run: for each run the objects of its `metrics.jsonl`, with `episodes` (cumulative),
+        rows_by_run: for each run, the rows of its `metrics.jsonl` with `episodes` (cumulative),
             `gate_entropy` (nat) and `skill_usage` ([K] or [seeds, K], for the number of skills);
-            `skill_distance` is drawn where present. Numbers, or lists with one a training seed:
-            then every seed is a thin line and their mean a bold one. NaN and None leave a gap.
-        title: stands above the panels.
+            `skill_distance` is drawn if present. Numbers, or lists of one per training seed: then
+            each seed is a thin line and their mean a bold one. NaN and None leave a gap.
+        title: above the panels.
 
     Returns:
-        Left the entropy as a share of its maximum, log K: 1 mixes all skills evenly, 0 leaves one
-        alone. Right, if any run knows it, the mean absolute deviation of the skills' Q-values from
-        their mean.
+        Left, the entropy as a fraction of its maximum, log K: at 1 all skills have equal weight, at
+        0 one has all. Right, if any run has it, the mean absolute deviation of the Q-values of the
+        skills from their mean.
 
     Raises:
-        ValueError: no runs, or a run without rows, without these metrics, or of one skill.
+        ValueError: no runs, or a run without rows, without these metrics, or with one skill.
     """
     if not rows_by_run:
         raise ValueError("no runs, expected at least one")
     for run, rows in rows_by_run.items():
-        needed = ("episodes", "gate_entropy", "skill_usage")
-        if not rows or any(name not in row for row in rows for name in needed):
-            raise ValueError(f"run {run}: {len(rows)} rows, expected some, all with {needed}")
+        required = ("episodes", "gate_entropy", "skill_usage")
+        if not rows or any(name not in row for row in rows for name in required):
+            raise ValueError(f"run {run}: {len(rows)} rows, expected some, all with {required}")
         if np.shape(rows[0]["skill_usage"])[-1] < 2:
             raise ValueError(f"run {run} has 1 skill, expected at least 2")
     has_distance = any("skill_distance" in row for rows in rows_by_run.values() for row in rows)

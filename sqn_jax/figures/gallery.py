@@ -1,4 +1,4 @@
-"""The maps side by side, and what the robot sees in them."""
+"""The maps side by side, and the scans of the robot in them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from sqn_jax.figures.ground import arrowhead, draw_map
 from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap
 
-MAX_SCANS = 6  # below each map of `observation_patterns`
+MAX_SCANS = 6  # below each map in `observation_patterns`
 
 
 def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
-    """One panel a map, axes in m, its evaluation points numbered.
+    """Draw maps side by side, axes in m, with numbered evaluation points.
 
     Raises:
-        ValueError: there are no maps.
+        ValueError: no maps.
     """
     if not maps:
         raise ValueError("no maps, expected at least one")
@@ -33,14 +33,14 @@ def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
     panels = figure.subplots(1, len(maps), squeeze=False)[0]
     for axes, occupancy_map in zip(panels, maps, strict=True):
         _draw_panel(axes, occupancy_map)
-        for number, place in enumerate(occupancy_map.evaluation_points, start=1):
-            _draw_place(axes, place, str(number), COLORS[1])
+        for number, point in enumerate(occupancy_map.evaluation_points, start=1):
+            _draw_point(axes, point, str(number), COLORS[1])
     panels[0].set_ylabel("y [m]", fontsize=8)
     return figure
 
 
 def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
-    """A map with its name and its size."""
+    """Draw a map with its name and size."""
     width_m, height_m = occupancy_map.size_m
     draw_map(axes, occupancy_map)
     axes.set_title(plain(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m"), fontsize=10)
@@ -48,9 +48,9 @@ def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
     axes.set_xlabel("x [m]", fontsize=8)
 
 
-def _draw_place(axes: Axes, place: NDArray[np.floating], name: str, color: str) -> None:
-    """A dot at a place x m, y m with a short name in it."""
-    x, y = (float(value) for value in place)
+def _draw_point(axes: Axes, point: NDArray[np.floating], name: str, color: str) -> None:
+    """Draw a dot at a point x m, y m with a short name in it."""
+    x, y = (float(value) for value in point)
     axes.plot(x, y, marker="o", ms=11, color=color, mec="white")
     style: dict[str, Any] = {"color": "white", "fontsize": 7, "fontweight": "bold"}
     axes.annotate(name, (x, y), ha="center", va="center", **style)
@@ -59,29 +59,29 @@ def _draw_place(axes: Axes, place: NDArray[np.floating], name: str, color: str) 
 def observation_patterns(
     episodes: Sequence[Episode], *, scans: int = 4, title: str = "What the robot sees"
 ) -> Figure:
-    """Draw the maps, and below each what its range beams see from a few places (paper, maps).
+    """Draw maps, and below each map scans from a few places (paper, maps).
 
-    A pattern is the outline of a scan in the robot's own frame, straight ahead to the right, within
-    the circle of the sensor's reach. Its letter says where on the map it was taken. The places are
-    those of the way until the goal that are farthest from each other, the start first.
+    A pattern is the outline of a scan in the robot's frame, forward to the right, within a circle
+    of the sensor's range. Its letter marks the place on the map. The places are those of the path
+    to the goal that are farthest from each other, starting with the start.
 
     Args:
         episodes: one for each map.
-        scans: patterns a map, 1..6.
-        title: stands above all panels.
+        scans: patterns per map, 1..6.
+        title: above all panels.
 
     Raises:
-        ValueError: there is no episode, or the number of scans is out of its range.
+        ValueError: no episode, or the number of scans is out of its range.
     """
     if not episodes:
         raise ValueError("no episodes, expected at least one a map")
     if not 1 <= scans <= MAX_SCANS:
         raise ValueError(f"scans is {scans}, expected 1 to {MAX_SCANS}")
     columns = 1 if scans == 1 else 2
-    lines = -(-scans // columns)
+    rows = -(-scans // columns)
     width = WIDTH_IN / len(episodes)
     tallest = max(e.occupancy_map.size_m[1] / e.occupancy_map.size_m[0] for e in episodes)
-    heights = [min(width * tallest, 6.0) + 0.2, lines * min(width / columns, 2.2)]
+    heights = [min(width * tallest, 6.0) + 0.2, rows * min(width / columns, 2.2)]
     size = (WIDTH_IN, sum(heights) + 0.8)
     figure = Figure(figsize=size, dpi=DPI)
     figure.set_layout_engine("constrained", w_pad=0.01, wspace=0.0)
@@ -92,35 +92,35 @@ def observation_patterns(
         above.locator_params(nbins=6, steps=[1, 2, 5, 10])
         if column == 0:
             above.set_ylabel("y [m]", fontsize=8)
-        # A narrow empty column keeps the patterns of neighboring maps apart.
-        below = grid[1, column].subgridspec(lines, columns + 1, width_ratios=[1] * columns + [0.1])
+        # A narrow empty column separates the patterns of neighboring maps.
+        below = grid[1, column].subgridspec(rows, columns + 1, width_ratios=[1] * columns + [0.1])
         for number, index in enumerate(spread_steps(episode, scans)):
             letter = string.ascii_uppercase[number]
-            _draw_place(above, episode.poses[index, :2], letter, COLORS[0])
+            _draw_point(above, episode.poses[index, :2], letter, COLORS[0])
             _draw_pattern(
                 figure.add_subplot(below[divmod(number, columns)]), episode, index, letter
             )
     reach = f"{episodes[0].max_range:g} m"
     figure.suptitle(plain(title))
     figure.supxlabel(
-        f"circle: {reach}, the sensor's reach; the robot looks to the right", fontsize=9
+        f"circle: {reach}, the range of the sensor; the robot looks to the right", fontsize=9
     )
     return figure
 
 
 def spread_steps(episode: Episode, count: int) -> list[int]:
-    """Moments in 0..T until the goal at places far apart: each the farthest from those before."""
-    places = episode.poses[: episode.time_steps + 1, :2]
+    """Steps in 0..T up to the goal at points far apart: each is the farthest from those before."""
+    points = episode.poses[: episode.time_steps + 1, :2]
     chosen = [0]
-    nearest = np.linalg.norm(places - places[0], axis=1)
-    while len(chosen) < min(count, len(places)):
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    distances = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distances.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return sorted(chosen)
 
 
 def _draw_pattern(axes: Axes, episode: Episode, index: int, letter: str) -> None:
-    """A scan in the robot's frame: x m ahead, to the right; y m to the robot's left, upwards."""
+    """Draw a scan in the robot's frame: x m forward points right, y m to its left points up."""
     angles, reach = episode.beam_angles(), episode.ranges[index]
     ends = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=-1)
     outline = np.concatenate([ends, np.zeros((1, 2))])

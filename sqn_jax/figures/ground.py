@@ -1,4 +1,4 @@
-"""What lies under a path, and the marks on it: map, field, scan, robot, goal, skill colors."""
+"""Elements of the pictures: map, distance field, scan, robot, start, goal, paths, legends."""
 
 from __future__ import annotations
 
@@ -27,50 +27,50 @@ Floats = NDArray[np.floating]
 
 UNREACHABLE, RED, YELLOW, FREE, SEEN = "#b9b9b9", "#b00020", "#ffd92f", "#f7f7f4", "#cfe3c8"
 
-# Few and light shades, so that their steps read as height lines and paths stand out.
+# Few and light shades, so that their edges look like contour lines and paths stand out.
 FIELD_MAP = ListedColormap(np.linspace([0.985, 0.99, 0.975], [0.70, 0.80, 0.82], 12))
-# From skill 2's color over gray to skill 1's; the dark edge of a path keeps the gray visible.
+# From the color of skill 2 over gray to that of skill 1; paths have a dark edge around the gray.
 SKILL_MAP = LinearSegmentedColormap.from_list("skills", [COLORS[1], "#dcdcdc", COLORS[0]], 255)
 ONE_SKILL = COLORS[3]
 
 
 def extent(occupancy_map: OccupancyMap) -> dict[str, Any]:
-    """Options of `imshow` that put [H, W] cells where they lie in m, row 0 at the bottom."""
+    """Options of `imshow` that place [H, W] cells in coordinates in m, row 0 at the bottom."""
     width, height = occupancy_map.size_m
     return {"origin": "lower", "extent": (0.0, width, 0.0, height)}
 
 
 def draw_map(axes: Axes, occupancy_map: OccupancyMap) -> AxesImage:
-    """Obstacles dark, free cells light."""
+    """Draw the map: obstacles dark, free cells light."""
     cells = ListedColormap([FREE, OBSTACLE])
-    look = {**extent(occupancy_map), "interpolation": "nearest"}
-    return axes.imshow(occupancy_map.occupied, cmap=cells, vmin=0, vmax=1, **look)
+    options = {**extent(occupancy_map), "interpolation": "nearest"}
+    return axes.imshow(occupancy_map.occupied, cmap=cells, vmin=0, vmax=1, **options)
 
 
 def draw_field(
     axes: Axes, occupancy_map: OccupancyMap, field: NDArray[np.float32], norm: Normalize
 ) -> AxesImage:
-    """Obstacles dark, places without a path to the goal gray, all others by their distance."""
-    look = extent(occupancy_map)
+    """Draw a distance field [H, W], m: obstacles dark, cells without a path to the goal gray."""
+    options = extent(occupancy_map)
     cells = ListedColormap([UNREACHABLE, OBSTACLE])
-    axes.imshow(occupancy_map.occupied, cmap=cells, vmin=0, vmax=1, **look)
-    return axes.imshow(np.ma.masked_invalid(field), cmap=FIELD_MAP, norm=norm, **look)
+    axes.imshow(occupancy_map.occupied, cmap=cells, vmin=0, vmax=1, **options)
+    return axes.imshow(np.ma.masked_invalid(field), cmap=FIELD_MAP, norm=norm, **options)
 
 
 def draw_seen(axes: Axes, episode: Episode, index: int) -> None:
-    """The map with the area tinted that was seen before step `index`; obstacles lie on top."""
+    """Draw the map and tint the area seen before step `index`; obstacles are on top."""
     occupied = episode.occupancy_map.occupied
     seen = episode.covered_mask(index, (occupied.shape[0], occupied.shape[1]))
-    look = extent(episode.occupancy_map)
-    axes.imshow(seen, cmap=ListedColormap([FREE, SEEN]), vmin=0, vmax=1, **look)
+    options = extent(episode.occupancy_map)
+    axes.imshow(seen, cmap=ListedColormap([FREE, SEEN]), vmin=0, vmax=1, **options)
     obstacles = np.ma.masked_where(~occupied, occupied)
-    axes.imshow(obstacles, cmap=ListedColormap([OBSTACLE]), **look)
+    axes.imshow(obstacles, cmap=ListedColormap([OBSTACLE]), **options)
 
 
 def draw_scan(axes: Axes, episode: Episode, index: int) -> None:
-    """The area between the robot and the ends of its beams before step `index`.
+    """Draw the area between the robot and the ends of its beams before step `index`.
 
-    The robot's place closes the polygon where no beam looks, behind it.
+    The polygon is closed at the robot, since there are no beams behind it.
     """
     corners = np.concatenate([episode.beam_ends(index), episode.poses[index, None, :2]])
     color = COLORS[4]
@@ -78,48 +78,48 @@ def draw_scan(axes: Axes, episode: Episode, index: int) -> None:
 
 
 def draw_robot(axes: Axes, episode: Episode, index: int, *, size: float) -> None:
-    """An arrowhead of `size` m that points along the heading, centered on the robot."""
+    """Draw an arrowhead of `size` m along the heading, centered on the robot."""
     axes.add_patch(arrowhead(episode.poses[index], size))
 
 
 def arrowhead(pose: ArrayLike, size: float) -> Polygon:
-    """An arrowhead at a pose x m, y m, heading rad, its tip ahead; `size` m from tip to tail."""
+    """An arrowhead at a pose (x m, y m, heading rad) along the heading, of length `size` m."""
     x, y, heading = np.asarray(pose, dtype=np.float64)
     corners = size * np.array([[0.6, 0.0], [-0.4, 0.4], [-0.2, 0.0], [-0.4, -0.4]])
     cosine, sine = math.cos(heading), math.sin(heading)
-    turned = corners @ np.array([[cosine, sine], [-sine, cosine]])
-    return Polygon(turned + np.array([x, y]), fc=INK, ec="white", lw=0.7, zorder=8)
+    rotated = corners @ np.array([[cosine, sine], [-sine, cosine]])
+    return Polygon(rotated + np.array([x, y]), fc=INK, ec="white", lw=0.7, zorder=8)
 
 
 def draw_start(axes: Axes, episode: Episode) -> None:
-    """A white dot where the episode began; above a star, since other episodes may end there."""
+    """Draw a white dot at the start; above a star, since it may be the goal of other episodes."""
     axes.plot(*episode.poses[0, :2], "o", ms=5, mfc="white", mec=INK, mew=1.2, zorder=7.5)
 
 
 def draw_goal(axes: Axes, episode: Episode) -> None:
-    """A star at the goal, and the goal radius around it to scale."""
+    """Draw a star at the goal, and a circle of the goal radius."""
     x, y = (float(value) for value in episode.goal)
     axes.add_patch(Circle((x, y), episode.goal_radius, fill=False, ec=INK, lw=1.2, zorder=4))
     axes.plot(x, y, "*", ms=14, mfc=YELLOW, mec=INK, mew=1.0, zorder=7)
 
 
 def draw_cross(axes: Axes, x: float, y: float) -> None:
-    """A red cross where an episode ended without success."""
+    """Draw a red cross at the end of a failure."""
     cross = axes.plot(x, y, "x", ms=9, mec=RED, mew=2.5, zorder=6)[0]
     cross.set_path_effects([patheffects.withStroke(linewidth=4.5, foreground="white")])
 
 
 def mark_arrival(axes: Axes, episode: Episode) -> None:
-    """A line across a panel over time, s, at the moment the goal radius was entered."""
+    """Draw a vertical line over a time axis, s, at the entry into the goal radius."""
     axes.axvline(episode.time_steps * episode.time_step, color=INK, ls=":", lw=1.4)
 
 
 def draw_skill_path(axes: Axes, episode: Episode) -> LineCollection:
-    """The way from the start to the goal, each step in the color of its skill decision.
+    """Draw the path up to the goal; the color of a step is that of its skill decision.
 
-    With two skills the color is the weight of the first against the second, with more the skill
-    of the largest weight, with one always the same. Start and goal are marked, and where an episode
-    without success ended.
+    With two skills the color is the weight of the first one. With more it is that of the skill with
+    the largest weight. An agent without skills has one color. Start and goal are marked, and also
+    the end of a failure.
     """
     end = episode.time_steps
     points = episode.poses[: end + 1, :2].astype(np.float64)
@@ -142,18 +142,18 @@ def draw_skill_path(axes: Axes, episode: Episode) -> LineCollection:
 
 
 def skill_color(skill: int) -> str:
-    """The color of a skill, counted from 0, in all pictures."""
+    """The color of a skill, counted from 0; it is the same in all pictures."""
     return COLORS[skill % len(COLORS)]
 
 
 def path_legend(episodes: Sequence[Episode]) -> list[Line2D | Patch]:
-    """What the marks of these episodes' paths mean; the scale of two skills is a color bar's."""
-    marks = [("start", "o", 5, "white", INK), ("goal", "*", 13, YELLOW, INK)]
+    """Legend entries for the paths of these episodes; two skills have a color bar instead."""
+    markers = [("start", "o", 5, "white", INK), ("goal", "*", 13, YELLOW, INK)]
     if not all(episode.success for episode in episodes):
-        marks.append(("not reached", "x", 9, "none", RED))
+        markers.append(("not reached", "x", 9, "none", RED))
     handles: list[Line2D | Patch] = [
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
-        for label, marker, size, face, edge in marks
+        for label, marker, size, face, edge in markers
     ]
     counts = {episode.skill_weights.shape[1] for episode in episodes}
     if 1 in counts:
@@ -167,7 +167,7 @@ def path_legend(episodes: Sequence[Episode]) -> list[Line2D | Patch]:
 
 
 def skill_bar(figure: Figure, axes: Sequence[Axes]) -> None:
-    """The scale of the paths of two skills, below panels."""
+    """Add the color scale of the paths of two skills below panels."""
     scale = ScalarMappable(Normalize(0.0, 1.0), SKILL_MAP)
     bar = scale_below(figure, scale, axes, "weight of skill 1 against skill 2")
     bar.set_ticks(
@@ -178,9 +178,9 @@ def skill_bar(figure: Figure, axes: Sequence[Axes]) -> None:
 def scale_below(
     figure: Figure, scale: ScalarMappable, axes: Sequence[Axes], label: str
 ) -> Colorbar:
-    """A color bar below panels; beside them it would take their width."""
-    look: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45, "pad": 0.02}
-    bar = figure.colorbar(scale, ax=list(axes), **look)
+    """Add a color bar below panels; beside them it would reduce their width."""
+    options: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45, "pad": 0.02}
+    bar = figure.colorbar(scale, ax=list(axes), **options)
     bar.set_label(label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return bar

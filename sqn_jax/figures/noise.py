@@ -14,15 +14,15 @@ _MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
 def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
-    """Success over velocity noise and over range noise, one line an agent.
+    """Plot success over velocity noise and over range noise, one line per agent.
 
     Args:
-        results: entries of an evaluation file on one map, for one goal radius, each with one of
-            the two noises at 0.
-        title: stands above both panels.
+        results: entries of an evaluation file for one map and one goal radius, each with at least
+            one of the two noises at 0.
+        title: above both panels.
 
     Returns:
-        Two panels; the bars are the entries' 95 % intervals over episodes.
+        Two panels; the bars are 95 % intervals over episodes.
 
     Raises:
         ValueError: there are no entries.
@@ -40,8 +40,8 @@ def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
             entries = [e for e in results if e["agent"] == agent and e[other] == 0]
             entries = sorted(entries, key=lambda entry: entry[noise])
             success = [entry["success"] for entry in entries]
-            mean = np.array([told["mean"] for told in success])
-            low, high = np.array([told["ci95"] for told in success]).T
+            mean = np.array([metric["mean"] for metric in success])
+            low, high = np.array([metric["ci95"] for metric in success]).T
             axes.errorbar(
                 [entry[noise] for entry in entries],
                 mean,
@@ -62,8 +62,8 @@ def robustness(results: Sequence[Mapping[str, Any]], *, title: str) -> Figure:
 
 
 _NOISE_LABELS = {
-    ("velocity_noise", "relative"): "velocity noise, sigma as a share of full speed",
+    ("velocity_noise", "relative"): "velocity noise, sigma as a fraction of full speed",
     ("velocity_noise", "absolute"): "velocity noise, sigma in m/s and rad/s",
-    ("range_noise", "relative"): "range noise, half-width as a share of the reading",
-    ("range_noise", "absolute"): "range noise, half-width as a share of the range",
+    ("range_noise", "relative"): "range noise, half-width as a fraction of the reading",
+    ("range_noise", "absolute"): "range noise, half-width as a fraction of the range",
 }

@@ -1,4 +1,4 @@
-"""The paths that robots took, over the distance fields of their goals."""
+"""The paths of robots, over the distance fields of their goals."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
 Floats = NDArray[np.float64]
 
-MAX_PATHS = 8  # in one panel; more would hide each other
+MAX_PATHS = 8  # in a panel; more would hide each other
 
-# From skill 2, orange, over violet to skill 1, dark blue, their colors in all pictures; darker all
-# along, so that it survives grayscale.
+# From skill 2, orange, over violet to skill 1, dark blue, as in all pictures; steadily darker, so
+# that it can be read in grayscale.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
 class _Panel(NamedTuple):
-    """A goal (x, y) m and the indices of the episodes that had it; `reached` from the quickest."""
+    """A goal (x, y) m and the indices of its episodes; `reached` begins with the fastest."""
 
     goal: tuple[float, float]
     failed: NDArray[np.intp]
@@ -52,29 +52,31 @@ def trajectories(
 ) -> Figure:
     """Draw the paths of E episodes over the distance field of their goals, a panel for each goal.
 
-    A path ends where it first enters the goal radius; without success it is drawn whole and ends in
-    a cross. Its color is the weight of the first skill in each step. A panel draws at most
-    `MAX_PATHS` paths, failures first (they get half of the places, more if there are not enough
-    successes), successes evenly from the quickest to the slowest. The title counts all episodes;
-    its steps are the mean over those that reached the goal.
+    A path ends where it first enters the goal radius; without success it is drawn to its end, which
+    is marked by a cross. Its color is the weight of the first skill in each step. A panel has at
+    most `MAX_PATHS` paths. Half of them are failures (more if there are not enough successes); the
+    successes are evenly spaced from the fastest to the slowest. The title counts all episodes; its
+    steps are the mean over those that reached the goal.
 
-    With more goals than panels, half of the panels go to the goals with most failures, the rest to
-    those with most episodes; where goals are equal in that, the one farthest from those chosen.
+    If there are more goals than panels, half of the panels are for the goals with the most failures
+    and the others for those with the most episodes; of equal goals, the one farthest from those
+    chosen before is next.
 
     Args:
-        occupancy_map: the map the episodes ran on.
-        goals: [E, 2] x, y in the grid frame, m; equal within 1e-6 m means the same goal.
+        occupancy_map: the map of the episodes.
+        goals: [E, 2] x m, y m in the grid frame; equal within 1e-6 m means the same goal.
         poses: [T + 1, E, 3] x m, y m, heading rad; the first is the start.
-        skill_weights: [T, E, K] the skill decision of each step, 0..1; K = 1 gives one color.
-        success: [E] bool, the goal was reached.
-        time_steps: [E] int, the step of the first entry, counted from 1; not read for failures.
+        skill_weights: [T, E, K] in 0..1 for each step; K = 1 gives one color.
+        success: [E] bool, whether the goal was reached.
+        time_steps: [E] int, the step that entered the goal radius, counted from 1; ignored for
+            failures.
         goal_radius: m.
-        title: stands above all panels.
-        max_panels: goals shown at most, >= 1.
+        title: above all panels.
+        max_panels: largest number of goals shown, >= 1.
         robot_radius: m; where the robot does not fit, there is no distance to the goal.
 
     Raises:
-        ValueError: shapes that do not belong together, no episode, or a goal in no free cell.
+        ValueError: inconsistent shapes, no episode, or a goal outside the free cells.
     """
     goals, poses = np.asarray(goals, dtype=np.float64), np.asarray(poses, dtype=np.float64)
     weights = np.asarray(skill_weights, dtype=np.float64)
@@ -105,13 +107,13 @@ def trajectories(
     if max(panel.total for panel in panels) > MAX_PATHS:
         shown += f", at most {MAX_PATHS} paths a goal drawn"
     figure.suptitle(plain(f"{title}\n{shown}"), fontsize=12)
-    # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
+    # With a fixed aspect the layout needs two passes; drawing makes the first.
     figure.draw_without_rendering()
     return figure
 
 
 def _check_shapes(weights: Floats, **arrays: NDArray[Any]) -> None:
-    """Refuse arrays that do not describe the same E episodes of T steps as `weights` [T, E, K]."""
+    """Raise ValueError if an array does not fit `weights` [T, E, K]."""
     if weights.ndim != 3 or weights.size == 0:
         raise ValueError(f"skill_weights has the shape {weights.shape}, expected [T, E, K], none 0")
     length, count, _ = weights.shape
@@ -125,65 +127,67 @@ def _check_shapes(weights: Floats, **arrays: NDArray[Any]) -> None:
 def _panels_of(goals: Floats, success: NDArray[np.bool_], steps: NDArray[Any]) -> list[_Panel]:
     """Group episodes by goal, in the order of their first appearance."""
     panels = []
-    left = np.arange(len(goals))
-    while left.size:
-        same = np.abs(goals[left] - goals[left[0]]).max(axis=1) <= 1e-6
-        members, (x, y) = left[same], goals[left[0]]
+    remaining = np.arange(len(goals))
+    while remaining.size:
+        first = goals[remaining[0]]
+        same_goal = np.abs(goals[remaining] - first).max(axis=1) <= 1e-6
+        members, (x, y) = remaining[same_goal], first
         reached = members[success[members]]
         by_steps = np.argsort(steps[reached], kind="stable")
         panels.append(_Panel((x, y), members[~success[members]], reached[by_steps], members.size))
-        left = left[~same]
+        remaining = remaining[~same_goal]
     return panels
 
 
 def _chosen_panels(panels: list[_Panel], limit: int) -> list[_Panel]:
-    """At most `limit` panels, by the rule that `trajectories` states."""
+    """At most `limit` panels, by the rule in `trajectories`."""
     chosen: list[_Panel] = []
 
     def rank(panel: _Panel) -> tuple[int, int, float]:
-        apart = min((math.dist(panel.goal, other.goal) for other in chosen), default=0.0)
+        distance = min((math.dist(panel.goal, other.goal) for other in chosen), default=0.0)
         failures = panel.failed.size if 2 * len(chosen) < limit else 0
-        return failures, panel.total, apart
+        return failures, panel.total, distance
 
-    left = list(panels)
-    while left and len(chosen) < limit < len(panels):
-        chosen.append(left.pop(max(range(len(left)), key=lambda i: rank(left[i]))))
+    remaining = list(panels)
+    while remaining and len(chosen) < limit < len(panels):
+        best = max(range(len(remaining)), key=lambda i: rank(remaining[i]))
+        chosen.append(remaining.pop(best))
     return chosen or panels
 
 
 def _chosen_episodes(panel: _Panel) -> NDArray[np.intp]:
-    """The episodes drawn, failures first, by the rule that `trajectories` states."""
+    """The episodes to draw, failures first, by the rule in `trajectories`."""
     failed = _evenly(panel.failed, max(MAX_PATHS // 2, MAX_PATHS - panel.reached.size))
     return np.concatenate([failed, _evenly(panel.reached, MAX_PATHS - failed.size)])
 
 
 def _evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """At most `count` items, evenly from the first to the last."""
+    """At most `count` items, evenly spaced from the first to the last."""
     return items[np.linspace(0, items.size - 1, min(count, items.size)).round().astype(int)]
 
 
 def _panel_grid(occupancy_map: OccupancyMap, count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with one panel a goal, its height fitted to the shape of the map."""
-    columns = min(count, 2)  # three would squeeze the titles into each other
-    lines = math.ceil(count / columns)
+    """A figure with one panel per goal; its height fits the shape of the map."""
+    columns = min(count, 2)  # with three the titles would overlap
+    rows = math.ceil(count / columns)
     width, height = occupancy_map.size_m
     panel_width = (WIDTH_IN - 2.2) / columns
-    height_in = lines * (panel_width * height / width + 0.35) + 1.2
+    height_in = rows * (panel_width * height / width + 0.35) + 1.2
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="compressed")
-    grid = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+    grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     for axes in grid[count:]:
         axes.remove()
     for number, axes in enumerate(grid[:count]):
-        lowest, leftmost = number + columns >= count, number % columns == 0
+        is_lowest, is_leftmost = number + columns >= count, number % columns == 0
         axes.set(aspect="equal", xlim=(0, width), ylim=(0, height))
-        axes.set(xlabel="x, m" if lowest else "", ylabel="y, m" if leftmost else "")
+        axes.set(xlabel="x, m" if is_lowest else "", ylabel="y, m" if is_leftmost else "")
         axes.locator_params(nbins=9, steps=[1, 2, 5, 10])
-        axes.tick_params(labelsize=9, labelbottom=lowest)
+        axes.tick_params(labelsize=9, labelbottom=is_lowest)
     return figure, grid[:count]
 
 
 def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bool) -> None:
-    """One path [S + 1, 3] colored by the weights [S] of its steps, with its start and its end."""
+    """Draw a path [S + 1, 3], colored by the weights [S] of its steps, with its start and end."""
     points = poses[:, :2]
     segments = list(np.stack([points[:-1], points[1:]], axis=1))
     width, order = (2.0, 3) if reached else (1.4, 2)
@@ -199,24 +203,24 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
 
 
 def _draw_goal(axes: Axes, panel: _Panel, steps: NDArray[Any], goal_radius: float) -> None:
-    """The goal, and above the panel how many reached it, in how many steps on average."""
+    """Draw the goal; the title has the number of successes and their mean number of steps."""
     axes.add_patch(Circle(panel.goal, goal_radius, fill=False, ec=INK, lw=1.2, zorder=4))
     axes.plot(*panel.goal, "*", ms=11, mfc=YELLOW, mec=INK, mew=1.0, zorder=7)
     mean = f", {steps[panel.reached].mean():.0f} steps" if panel.reached.size else ""
-    where = f"goal ({panel.goal[0]:.1f}, {panel.goal[1]:.1f}) m"
-    axes.set_title(f"{where}: {panel.reached.size} of {panel.total} reached{mean}", fontsize=10)
+    goal = f"goal ({panel.goal[0]:.1f}, {panel.goal[1]:.1f}) m"
+    axes.set_title(f"{goal}: {panel.reached.size} of {panel.total} reached{mean}", fontsize=10)
 
 
 def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> None:
-    """What the marks mean, below the panels."""
-    marks = [("start", "o", 6, "white", INK), ("goal", "*", 11, YELLOW, INK)]
-    marks.append((f"goal radius {goal_radius:g} m", "o", 10, "none", INK))
+    """Add the legend of the markers below the panels."""
+    markers = [("start", "o", 6, "white", INK), ("goal", "*", 11, YELLOW, INK)]
+    markers.append((f"goal radius {goal_radius:g} m", "o", 10, "none", INK))
     if any_failure:
-        marks.append(("not reached", "x", 9, "none", RED))
+        markers.append(("not reached", "x", 9, "none", RED))
     handles: list[Line2D | Patch] = [
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
-        for label, marker, size, face, edge in marks
+        for label, marker, size, face, edge in markers
     ]
     handles += [Patch(fc=OBSTACLE, label="obstacle"), Patch(fc=UNREACHABLE, label="unreachable")]
-    look: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
-    figure.legend(handles=handles, loc="outside lower center", fontsize=9, **look)
+    options: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
+    figure.legend(handles=handles, loc="outside lower center", fontsize=9, **options)

@@ -1,4 +1,4 @@
-"""One frame of an episode's film: where what stands, and how it is drawn again and again."""
+"""The frames of an animation: their layout, and fast repeated drawing."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from sqn_jax.figures.ground import (
 from sqn_jax.figures.style import COLORS, INK, OBSTACLE, tidy
 
 WIDTH, HEIGHT = 800, 580
-"""The frame that all places below are measured in, pixels; others are that frame scaled."""
+"""Size of the frame for which the boxes below are given, pixels; other frames are scaled."""
 
 MAP_BOX = (12, 44, 496, 496)
 VIEW_BOX = (534, 62, 254, 254)
 SKILL_BOX = (534, 346, 254, 16)
 REWARD_BOX = (574, 418, 214, 116)
-"""Left, top, width and height, pixels from the upper left corner."""
+"""Left, top, width, height; pixels from the upper left corner."""
 
 AFTER_ARRIVAL = 2.0
-"""How long the film goes on after the arrival, s of the episode."""
+"""Time shown after the arrival, s of the episode."""
 
 ROBOT = COLORS[5]
 ROBOT_PX = 19
@@ -53,16 +53,16 @@ KEY_COLORS = (
     *("#ffffff", FREE, SEEN, OBSTACLE, INK, ROBOT, SCAN, YELLOW, RED, REACHED, ONE_SKILL),
     *COLORS,
 )
-"""What must keep its color in a palette."""
+"""Colors that must be part of a palette."""
 
 
 def rgb(color: str) -> NDArray[np.uint8]:
-    """[3] uint8."""
+    """A color as [3] uint8."""
     return np.rint(255 * np.array(to_rgb(color))).astype(np.uint8)
 
 
 def last_step(episode: Episode) -> int:
-    """The last state 0..T that a film shows: a little after the arrival, if there is one."""
+    """The last state 0..T of an animation: shortly after the arrival, if there is one."""
     if not episode.success:
         return episode.num_steps
     after = round(AFTER_ARRIVAL / episode.time_step)
@@ -70,7 +70,7 @@ def last_step(episode: Episode) -> int:
 
 
 def _path_colors(weights: NDArray[np.floating]) -> NDArray[np.floating]:
-    """RGBA [T, 4] of the steps of a path from their skill decisions [T, K]."""
+    """RGBA [T, 4] of the steps of a path from their skill weights [T, K]."""
     skills = weights.shape[1]
     if skills == 1:
         return np.tile(to_rgba_array(ONE_SKILL), (len(weights), 1))
@@ -86,7 +86,7 @@ class Screen:
         self.episode = episode
         self._scale = width_px / WIDTH
         dpi = width_px / 8
-        # A trace more than the height, or rounding takes a row of pixels away.
+        # Slightly more than the height, or rounding removes a row of pixels.
         size = (8.0, (height_px + 0.01) / dpi)
         self.figure = Figure(figsize=size, dpi=dpi)
         self._canvas = FigureCanvasAgg(self.figure)
@@ -96,7 +96,7 @@ class Screen:
         self._make_view()
         self._make_skills()
         self._make_rewards()
-        self._make_words()
+        self._make_status()
         for _, artist in self._moving:
             artist.set_animated(True)
         self._canvas.draw()
@@ -109,13 +109,13 @@ class Screen:
         self._update_view(index)
         self._update_skills(index)
         self._update_rewards(index)
-        self._update_words(index)
+        self._update_status(index)
         self._pixels[:] = self._background
         top, left = self.map_corner
         mask = self._seen(index)
         rows, columns = mask.shape
         panel = self._pixels[top : top + rows, left : left + columns, :3]
-        panel[:] = np.where(mask[..., None], self._tinted, self._plain)
+        panel[:] = np.where(mask[..., None], self._tinted, self._unseen)
         renderer = self._canvas.get_renderer()
         for axes, artist in self._moving:
             if axes is None:
@@ -134,11 +134,11 @@ class Screen:
         columns = max(round(width * self.pixels_per_meter), 1)
         rows = max(round(height * self.pixels_per_meter), 1)
         self.map_corner = (top + (box - rows) // 2, left + (box - columns) // 2)
-        place = (self.map_corner[1], self.map_corner[0], columns, rows)
-        axes = self._axes(place, scaled=False)
+        box_px = (self.map_corner[1], self.map_corner[0], columns, rows)
+        axes = self._axes(box_px, scaled=False)
         axes.set(xlim=(0, width), ylim=(0, height), xticks=[], yticks=[])
         axes.patch.set_visible(False)
-        self._plain, self._tinted = self._map_pixels(rows, columns)
+        self._unseen, self._tinted = self._map_pixels(rows, columns)
         x, y = np.meshgrid(
             (np.arange(columns) + 0.5) * width / columns,
             (np.arange(rows)[::-1] + 0.5) * height / rows,
@@ -147,10 +147,10 @@ class Screen:
         self._nearest = np.ravel_multi_index(episode.lattice.nearest_point(x, y), points)
         self._points = episode.poses[:, :2].astype(np.float64)
         self._scan = self._add(axes, axes.fill([], [], fc=(*to_rgb(SCAN), 0.35), ec=SCAN, lw=1)[0])
-        look: dict[str, Any] = {"solid_capstyle": "round", "solid_joinstyle": "round"}
-        self._edge = self._add(axes, axes.plot([], [], color=INK, lw=3.6, **look)[0])
+        style: dict[str, Any] = {"solid_capstyle": "round", "solid_joinstyle": "round"}
+        self._edge = self._add(axes, axes.plot([], [], color=INK, lw=3.6, **style)[0])
         pairs = np.stack([self._points[:-1], self._points[1:]], axis=1)
-        self._pieces = [Path(pair) for pair in pairs]
+        self._segments = [Path(pair) for pair in pairs]
         self._colors: Any = _path_colors(episode.skill_weights)
         self._path = PathCollection([], linewidths=2.4, capstyle="round", facecolors="none")
         axes.add_collection(self._path, autolim=False)
@@ -168,60 +168,63 @@ class Screen:
         robot.set(fc=ROBOT, ec=INK, lw=1.0)
         axes.add_patch(robot)
         self._robot = self._add(axes, robot)
-        self._draw_legend(place)
+        self._draw_legend(box_px)
 
     def _map_pixels(self, rows: int, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The map [rows, columns, 3] with nothing seen, and all seen; a wall is the same in both.
+        """The map [rows, columns, 3] uint8 with nothing seen, and with everything seen.
 
-        A pixel is as dark as its share of obstacles, so that walls thinner than it do not vanish.
+        A pixel is as dark as its fraction of obstacles, so that thin walls do not vanish.
         """
         occupied = self.episode.occupancy_map.occupied
-        fine = 4
-        lines = ((np.arange(rows * fine) + 0.5) * occupied.shape[0] / (rows * fine)).astype(int)
-        places = ((np.arange(columns * fine) + 0.5) * occupied.shape[1] / (columns * fine)).astype(
-            int
+        fine = 4  # samples per pixel and axis
+        y, x = (
+            ((np.arange(count * fine) + 0.5) * cells / (count * fine)).astype(int)
+            for count, cells in zip((rows, columns), occupied.shape, strict=True)
         )
-        parts = occupied[lines[::-1]][:, places].reshape(rows, fine, columns, fine)
-        share = parts.mean(axis=(1, 3))[..., None]
-        plain, tinted = (
-            np.rint(share * rgb(OBSTACLE) + (1 - share) * rgb(ground)).astype(np.uint8)
+        samples = occupied[y[::-1]][:, x].reshape(rows, fine, columns, fine)
+        fraction = samples.mean(axis=(1, 3))[..., None]
+        unseen, tinted = (
+            np.rint(fraction * rgb(OBSTACLE) + (1 - fraction) * rgb(ground)).astype(np.uint8)
             for ground in (FREE, SEEN)
         )
-        return plain, tinted
+        return unseen, tinted
 
     def _seen(self, index: int) -> NDArray[np.bool_]:
-        """`Episode.covered_mask` at the panel's pixels, the upper row first."""
+        """`Episode.covered_mask` at the pixels of the panel, top row first."""
         mask: NDArray[np.bool_] = self.episode.covered_bits(index).ravel()[self._nearest]
         return mask
 
-    def _draw_legend(self, place: tuple[int, int, int, int]) -> None:
-        """Below the map: how long a meter is, and what the marks mean."""
+    def _draw_legend(self, box: tuple[int, int, int, int]) -> None:
+        """Draw the scale and the legend below the map."""
         longest = 80 * self._scale / self.pixels_per_meter
         length = max((m for m in (0.5, 1, 2, 5, 10, 20, 50, 100) if m <= longest), default=0.2)
-        left, bottom = place[0], place[1] + place[3]
+        left, bottom = box[0], box[1] + box[3]
         x = np.array([left, left + length * self.pixels_per_meter]) / self._size[1]
         y = 1 - (bottom + 12 * self._scale) / self._size[0]
         self.figure.add_artist(Line2D(x, [y, y], color=INK, lw=2, solid_capstyle="butt"))
         self.figure.text(x.mean(), y - 0.012, f"{length:g} m", ha="center", va="top", fontsize=8)
-        marks = [("start", "o", 6, "white"), ("goal", "*", 11, YELLOW), ("robot", "^", 8, ROBOT)]
+        markers = [("start", "o", 6, "white"), ("goal", "*", 11, YELLOW), ("robot", "^", 8, ROBOT)]
         handles: list[Line2D | Patch] = [
             Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=INK, label=label)
-            for label, marker, size, face in marks
+            for label, marker, size, face in markers
         ]
         handles.append(Patch(fc=SEEN, ec="0.6", lw=0.5, label="seen"))
         handles.append(Patch(fc=(*to_rgb(SCAN), 0.35), ec=SCAN, label="scan"))
-        # With more than two skills the numbers above their bar have the colors.
-        named = {1: [("path", ONE_SKILL)], 2: [(f"skill {k + 1}", skill_color(k)) for k in (0, 1)]}
+        # More than two skills have their numbers in color above their bar.
+        path_labels = {
+            1: [("path", ONE_SKILL)],
+            2: [(f"skill {k + 1}", skill_color(k)) for k in (0, 1)],
+        }
         handles += [
             Line2D([], [], color=color, lw=3, label=name)
-            for name, color in named.get(self.episode.skill_weights.shape[1], [])
+            for name, color in path_labels.get(self.episode.skill_weights.shape[1], [])
         ]
         right = (MAP_BOX[0] + MAP_BOX[2]) / WIDTH
-        look: dict[str, Any] = {"frameon": False, "columnspacing": 1.1, "handletextpad": 0.4}
-        look |= {"handlelength": 1.3, "borderaxespad": 0, "borderpad": 0, "fontsize": 8}
+        options: dict[str, Any] = {"frameon": False, "columnspacing": 1.1, "handletextpad": 0.4}
+        options |= {"handlelength": 1.3, "borderaxespad": 0, "borderpad": 0, "fontsize": 8}
         anchor = (right, 1 - (bottom + 9 * self._scale) / self._size[0])
         self.figure.legend(
-            handles=handles, ncols=len(handles), loc="upper right", bbox_to_anchor=anchor, **look
+            handles=handles, ncols=len(handles), loc="upper right", bbox_to_anchor=anchor, **options
         )
 
     def _update_map(self, index: int) -> None:
@@ -229,7 +232,7 @@ class Screen:
         corners = np.concatenate([episode.beam_ends(index), episode.poses[index, None, :2]])
         self._scan.set_xy(corners)
         self._edge.set_data(*self._points[: index + 1].T)
-        self._path.set_paths(self._pieces[:index])
+        self._path.set_paths(self._segments[:index])
         self._path.set_edgecolor(self._colors[:index])
         self._robot.set_xy(arrowhead(episode.poses[index], self._arrow_m).get_xy())
 
@@ -261,8 +264,8 @@ class Screen:
         ends = np.stack([-ranges * np.sin(angles), ranges * np.cos(angles)], axis=-1)
         self._own_scan.set_xy(np.concatenate([ends, np.zeros((1, 2))]))
         self._hits.set_data(*ends[ranges < 0.999 * episode.max_range].T)
-        away = math.dist(episode.poses[index, :2], episode.goal)
-        shown, heading = min(away, episode.max_range), float(self._goal_headings[index])
+        distance = math.dist(episode.poses[index, :2], episode.goal)
+        shown, heading = min(distance, episode.max_range), float(self._goal_headings[index])
         self._own_goal.set_data([-shown * math.sin(heading)], [shown * math.cos(heading)])
 
     # ----------------------------------------------------------------------------- skills, rewards
@@ -279,8 +282,8 @@ class Screen:
             bar = Rectangle((0, 0), 0, 1, fc=skill_color(skill), ec="white", lw=0.5)
             axes.add_patch(bar)
             self._bars.append(self._add(axes, bar))
-            place = ((skill + 0.5) / skills, 1.25)
-            text = axes.text(*place, "", ha="center", va="bottom", fontsize=9, weight="bold")
+            position = ((skill + 0.5) / skills, 1.25)
+            text = axes.text(*position, "", ha="center", va="bottom", fontsize=9, weight="bold")
             text.set_color(skill_color(skill))
             self._weights.append(self._add(axes, text))
 
@@ -315,63 +318,63 @@ class Screen:
             lines.append(self._add(axes, line))
         self._reward_lines = lines
         self._heading(SKILL_BOX, "reward so far, weighted", above=-48)
-        look: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 1.8, "ncols": 3}
-        look |= {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0, "borderpad": 0}
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.03), **look)
+        options: dict[str, Any] = {"frameon": False, "fontsize": 8, "handlelength": 1.8, "ncols": 3}
+        options |= {"columnspacing": 1.0, "handletextpad": 0.4, "borderaxespad": 0, "borderpad": 0}
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.03), **options)
 
     def _update_rewards(self, index: int) -> None:
         for part, line in enumerate(self._reward_lines):
             line.set_data(self._times[: index + 1], self._sums[: index + 1, part])
 
-    # --------------------------------------------------------------------------------------- words
+    # -------------------------------------------------------------------------------------- status
 
-    def _make_words(self) -> None:
+    def _make_status(self) -> None:
         episode = self.episode
         y = 1 - 22 / HEIGHT
-        look: dict[str, Any] = {"va": "center", "parse_math": False}
-        words = self.figure.text(1 - 12 / WIDTH, y, "", ha="right", fontsize=10, **look)
-        self._words = self._add(None, words)
-        name = self.figure.text(12 / WIDTH, y, "", weight="bold", fontsize=11, **look)
-        self._update_words(last_step(episode))  # Nothing that is said takes more room.
+        options: dict[str, Any] = {"va": "center", "parse_math": False}
+        status = self.figure.text(1 - 12 / WIDTH, y, "", ha="right", fontsize=10, **options)
+        self._status = self._add(None, status)
+        name = self.figure.text(12 / WIDTH, y, "", weight="bold", fontsize=11, **options)
+        self._update_status(last_step(episode))  # The longest status.
         renderer = self._canvas.get_renderer()
-        room = (WIDTH - 40) * self._scale - words.get_window_extent(renderer).width
-        for left_out in range(len(episode.agent)):
-            agent = episode.agent[: len(episode.agent) - left_out]
-            ellipsis = "\N{HORIZONTAL ELLIPSIS}" if left_out else ""
+        width_left = (WIDTH - 40) * self._scale - status.get_window_extent(renderer).width
+        for omitted in range(len(episode.agent)):
+            agent = episode.agent[: len(episode.agent) - omitted]
+            ellipsis = "\N{HORIZONTAL ELLIPSIS}" if omitted else ""
             name.set_text(f"{agent}{ellipsis} on {episode.occupancy_map.name}")
-            if name.get_window_extent(renderer).width <= room:
+            if name.get_window_extent(renderer).width <= width_left:
                 break
 
-    def _update_words(self, index: int) -> None:
+    def _update_status(self, index: int) -> None:
         episode = self.episode
-        away = math.dist(episode.poses[index, :2], episode.goal)
-        told = [f"step {index} of {episode.num_steps}", f"{index * episode.time_step:.1f} s"]
-        told.append(f"{away:.1f} m to the goal")
+        distance = math.dist(episode.poses[index, :2], episode.goal)
+        parts = [f"step {index} of {episode.num_steps}", f"{index * episode.time_step:.1f} s"]
+        parts.append(f"{distance:.1f} m to the goal")
         color = INK
         if episode.success and index >= episode.time_steps:
-            told.append(f"reached at step {episode.time_steps}")
+            parts.append(f"reached at step {episode.time_steps}")
             color = REACHED
         elif index == episode.num_steps:
-            told.append("not reached")
+            parts.append("not reached")
             color = RED
-        self._words.set(text="   ".join(told), color=color)
+        self._status.set(text="   ".join(parts), color=color)
 
     # ------------------------------------------------------------------------------------- helpers
 
     def _axes(self, box: tuple[int, int, int, int], *, scaled: bool = True) -> Axes:
-        """Axes in a box of pixels, of the frame as it stands above or `scaled` to its width."""
+        """Axes in a box of pixels of this frame or, if `scaled`, of the frame WIDTH x HEIGHT."""
         height, width = self._size
         if scaled:
             height, width = HEIGHT, WIDTH
         left, top, columns, rows = box
-        place = (left / width, 1 - (top + rows) / height, columns / width, rows / height)
-        return self.figure.add_axes(place)
+        position = (left / width, 1 - (top + rows) / height, columns / width, rows / height)
+        return self.figure.add_axes(position)
 
     def _heading(self, box: tuple[int, int, int, int], text: str, *, above: int = 6) -> None:
-        place = (box[0] / WIDTH, 1 - (box[1] - above) / HEIGHT)
-        self.figure.text(*place, text, fontsize=9, va="bottom")
+        position = (box[0] / WIDTH, 1 - (box[1] - above) / HEIGHT)
+        self.figure.text(*position, text, fontsize=9, va="bottom")
 
     def _add(self, axes: Axes | None, artist: Any) -> Any:
-        """Note an artist that is drawn anew in every frame, over those before it."""
+        """Register an artist to be redrawn in every frame, above those registered before."""
         self._moving.append((axes, artist))
         return artist

@@ -1,4 +1,4 @@
-"""Which skill drove where: paths in the colors of the skill decision, agents side by side."""
+"""Paths in the colors of the skill decision, on maps and for several agents side by side."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from sqn_jax.figures.style import DPI, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
 MAX_AGENTS = 5  # columns of `agents_side_by_side`; more would be too narrow for their titles
-MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit a page
+MAX_TASKS = 4  # rows of `agents_side_by_side`; more would not fit on a page
 
 
 def skill_trajectories(episodes: Sequence[Episode], *, title: str) -> Figure:
-    """Draw paths over the map in the colors of the skill decision, a panel for each map.
+    """Draw paths in the colors of the skill decision, a panel for each map.
 
-    With two skills the color runs from vermillion (skill 2 alone) over gray to blue (skill 1
-    alone); with more a step has the color of the skill of the largest weight; agents without
+    With two skills the color ranges from vermillion (skill 2 alone) over gray to blue (skill 1
+    alone). With more, a step has the color of the skill with the largest weight. Agents without
     skills have one color. A path ends where it first enters the goal radius; without success it is
-    drawn whole and ends in a cross.
+    drawn to its end, which is marked by a cross.
 
     Args:
-        episodes: of one map or several; all are drawn.
-        title: stands above all panels.
+        episodes: on one map or several; all are drawn.
+        title: above all panels.
 
     Raises:
-        ValueError: there is no episode.
+        ValueError: no episodes.
     """
     if not episodes:
         raise ValueError("no episodes, expected at least one")
     groups: list[list[Episode]] = []
     for episode in episodes:
-        own = [g for g in groups if _same_map(g[0].occupancy_map, episode.occupancy_map)]
-        own[0].append(episode) if own else groups.append([episode])
+        same_map = [g for g in groups if _is_same_map(g[0].occupancy_map, episode.occupancy_map)]
+        same_map[0].append(episode) if same_map else groups.append([episode])
     columns = math.ceil(len(groups) / math.ceil(len(groups) / 3))
     figure, grid = _map_grid([group[0].occupancy_map for group in groups], columns, tallest=6.0)
     for axes, group in zip(grid, groups, strict=True):
@@ -65,17 +65,18 @@ def skill_trajectories(episodes: Sequence[Episode], *, title: str) -> Figure:
 def agents_side_by_side(
     episodes_by_agent: Mapping[str, Sequence[Episode]], *, title: str
 ) -> Figure:
-    """Draw the same tasks driven by several agents: a row for each task, a column for each agent.
+    """Draw the paths of several agents: a row for each task, a column for each agent.
 
-    The ground is the true distance to the goal; paths have the colors of `skill_trajectories`.
+    The background is the length of the shortest path to the goal. Paths have the colors of
+    `skill_trajectories`.
 
     Args:
-        episodes_by_agent: for each agent its episodes, at most 4, all on one map; starts and goals
-            are the same for all agents, in the same order.
-        title: stands above all panels.
+        episodes_by_agent: at most 4 episodes for each agent, all on one map; the tasks and their
+            order are the same for all agents.
+        title: above all panels.
 
     Raises:
-        ValueError: no agent or more than 5, no episode or too many, or tasks that differ between
+        ValueError: no agents or more than 5, no episodes or too many, or tasks that differ between
             agents.
     """
     _check_tasks(episodes_by_agent)
@@ -90,15 +91,15 @@ def agents_side_by_side(
             axes = grid[row * len(columns) + column]
             image = draw_field(axes, episode.occupancy_map, field, norm)
             draw_skill_path(axes, episode)
-            told = f"{episode.time_steps} steps" if episode.success else "not reached"
-            axes.set_title(plain(f"{agent}: {told}"), fontsize=10)
+            outcome = f"{episode.time_steps} steps" if episode.success else "not reached"
+            axes.set_title(plain(f"{agent}: {outcome}"), fontsize=10)
     scale_below(figure, image, grid, "distance to the goal, m")
     _finish(figure, grid, [episode for task in tasks for episode in task], title)
     return figure
 
 
 def _check_tasks(episodes_by_agent: Mapping[str, Sequence[Episode]]) -> None:
-    """Refuse agents that were not given the same tasks."""
+    """Raise ValueError if the agents do not have the same tasks."""
     if not episodes_by_agent:
         raise ValueError("no agents, expected at least one")
     if len(episodes_by_agent) > MAX_AGENTS:
@@ -114,24 +115,25 @@ def _check_tasks(episodes_by_agent: Mapping[str, Sequence[Episode]]) -> None:
                 f"agent {agent} has {len(episodes)} episodes, expected {len(reference)} as {first}"
             )
         for number, (ours, theirs) in enumerate(zip(episodes, reference, strict=True)):
-            same_start = np.allclose(ours.poses[0], theirs.poses[0], atol=1e-4)
-            same_goal = np.allclose(ours.goal, theirs.goal, atol=1e-4)
-            same_map = _same_map(ours.occupancy_map, reference[0].occupancy_map)
-            if not (same_map and same_start and same_goal):
+            is_same_start = np.allclose(ours.poses[0], theirs.poses[0], atol=1e-4)
+            is_same_goal = np.allclose(ours.goal, theirs.goal, atol=1e-4)
+            is_same_map = _is_same_map(ours.occupancy_map, reference[0].occupancy_map)
+            if not (is_same_map and is_same_start and is_same_goal):
                 raise ValueError(
                     f"agent {agent}, episode {number}: another map, start or goal than {first}'s, "
                     "expected the same tasks on one map"
                 )
 
 
-def _same_map(one: OccupancyMap, other: OccupancyMap) -> bool:
-    if one is other:
+def _is_same_map(first: OccupancyMap, second: OccupancyMap) -> bool:
+    if first is second:
         return True
-    return one.resolution == other.resolution and np.array_equal(one.occupied, other.occupied)
+    has_same_resolution = first.resolution == second.resolution
+    return has_same_resolution and np.array_equal(first.occupied, second.occupied)
 
 
 def _distance_fields(tasks: Sequence[Episode]) -> NDArray[np.float32]:
-    """[tasks, H, W] m on the shortest way to each goal on their map, inf where there is none."""
+    """[tasks, H, W] m, length of the shortest path to each goal, inf where there is none."""
     occupancy_map = tasks[0].occupancy_map
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, tasks[0].robot_radius)
     return goal_distance(free, occupancy_map.resolution, [task.goal for task in tasks])
@@ -140,13 +142,13 @@ def _distance_fields(tasks: Sequence[Episode]) -> NDArray[np.float32]:
 def _map_grid(
     maps: Sequence[OccupancyMap], columns: int, *, tallest: float
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each map, fitted to their shapes but at most `tallest` inches."""
-    lines = math.ceil(len(maps) / columns)
-    shape = max(one.size_m[1] / one.size_m[0] for one in maps)
+    """A figure with a panel for each map, of their shape but at most `tallest` inches high."""
+    rows = math.ceil(len(maps) / columns)
+    shape = max(item.size_m[1] / item.size_m[0] for item in maps)
     panel_height = min(((WIDTH_IN - 0.3) / columns - 0.35) * shape, tallest)
-    size = (WIDTH_IN, lines * (panel_height + 0.35) + 2.1)
+    size = (WIDTH_IN, rows * (panel_height + 0.35) + 2.1)
     figure = Figure(figsize=size, dpi=DPI, layout="compressed")
-    grid = list(figure.subplots(lines, columns, squeeze=False).flat)
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes in grid[len(maps) :]:
         axes.remove()
     for number, (axes, occupancy_map) in enumerate(zip(grid, maps, strict=False)):
@@ -160,12 +162,12 @@ def _map_grid(
 
 
 def _finish(figure: Figure, grid: Sequence[Axes], episodes: Sequence[Episode], title: str) -> None:
-    """The scale of the skills where there are two, the legend, the title, and a settled layout."""
+    """Add the scale of two skills, the legend and the title, and compute the layout."""
     if any(episode.skill_weights.shape[1] == 2 for episode in episodes):
         skill_bar(figure, grid)
     handles = path_legend(episodes)
-    look: dict[str, Any] = {"loc": "outside lower center", "ncols": min(len(handles), 5)}
-    figure.legend(handles=handles, frameon=False, fontsize=9, **look)
+    options: dict[str, Any] = {"loc": "outside lower center", "ncols": min(len(handles), 5)}
+    figure.legend(handles=handles, frameon=False, fontsize=9, **options)
     figure.suptitle(plain(title))
-    # The layout of panels with a fixed aspect settles in the second pass; a drawing makes one.
+    # With a fixed aspect the layout needs two passes; drawing makes the first.
     figure.draw_without_rendering()

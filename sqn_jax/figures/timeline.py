@@ -1,4 +1,4 @@
-"""One episode in numbers over time: skill decision, Q-values, rewards, distance to the goal."""
+"""One episode over time: skill weights, Q-values, rewards, distance to the goal."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ _PART_STYLES = ((COLORS[2], "-"), (COLORS[5], "--"), ("#7a7a7a", "-."))
 
 
 def episode_timeline(episode: Episode, *, title: str) -> Figure:
-    """Draw an episode over time: skill weights, Q-values, rewards and the distance to the goal.
+    """Plot an episode over time: skill weights, Q-values, rewards and the distance to the goal.
 
-    The panels from above: the skill decision, stacked (left out for an agent without skills); the
-    value of the best action of each skill and of their weighted sum; the running sums of the
-    weighted parts of the reward; the distance to the goal in a straight line, shaded while the goal
-    was reachable (paper eq. 8), with a tick for each refused move. A dotted line in all panels is
-    the moment of arrival; the time axis goes on for a quarter of the way after it.
+    The panels, from top to bottom: the skill weights, stacked (omitted for an agent without
+    skills); the value of the best action of each skill and of their weighted sum; cumulative sums
+    of the weighted terms of the reward; the straight-line distance to the goal, shaded while the
+    goal was reachable (paper, eq. 8), with a tick for each refused move. A dotted line in all
+    panels marks the arrival; the time axis extends beyond it by a quarter of the time before.
 
     Args:
-        episode: what is drawn.
-        title: stands above all panels, with the outcome below it.
+        episode: the episode.
+        title: above all panels, followed by the outcome.
+
+    Returns:
+        Four panels, or three for an agent without skills.
     """
     episode = episode.first_steps(math.ceil(1.25 * episode.time_steps))
     skills = episode.skill_weights.shape[1]
@@ -52,25 +55,25 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
     figure.align_ylabels(panels)
     seconds = episode.time_steps * episode.time_step
     outcome = f"{episode.time_steps} steps, {seconds:.1f} s"
-    word = "reached after" if episode.success else "not reached in"
-    figure.suptitle(plain(f"{title}\ngoal {word} {outcome}"), fontsize=12)
+    verb = "reached after" if episode.success else "not reached in"
+    figure.suptitle(plain(f"{title}\ngoal {verb} {outcome}"), fontsize=12)
     return figure
 
 
 def _draw_weights(axes: Axes, episode: Episode) -> None:
-    """The weights [T, K] stacked from skill 1 at the bottom; each holds for its step."""
+    """The weights [T, K], stacked from skill 1 at the bottom, constant during each step."""
     edges = np.arange(episode.num_steps + 1) * episode.time_step
     weights = np.concatenate([episode.skill_weights, episode.skill_weights[-1:]])
     tops = np.cumsum(weights, axis=1)
     for skill in range(weights.shape[1]):
         low, high = tops[:, skill] - weights[:, skill], tops[:, skill]
-        look: dict[str, Any] = {"color": skill_color(skill), "label": f"skill {skill + 1}"}
-        axes.fill_between(edges, low, high, step="post", alpha=0.8, lw=0, **look)
+        options: dict[str, Any] = {"color": skill_color(skill), "label": f"skill {skill + 1}"}
+        axes.fill_between(edges, low, high, step="post", alpha=0.8, lw=0, **options)
     axes.set(ylim=(0, 1), ylabel="skill weight", axisbelow=True)
 
 
 def _draw_values(axes: Axes, episode: Episode) -> None:
-    """The value of the best action, of each skill and of the ensemble."""
+    """The value of the best action, for each skill and for the ensemble."""
     times = np.arange(episode.num_steps) * episode.time_step
     best = episode.skill_q_values.max(axis=2)
     if best.shape[1] > 1:
@@ -82,7 +85,7 @@ def _draw_values(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_rewards(axes: Axes, episode: Episode) -> None:
-    """The running sums of the weighted parts of the reward, and of the reward."""
+    """Cumulative sums of the weighted terms of the reward, and of the reward."""
     times = np.arange(episode.num_steps + 1) * episode.time_step
     sums = np.cumsum(np.concatenate([np.zeros((1, 3)), episode.reward_parts]), axis=0)
     for values, name, (color, style) in zip(sums.T, _REWARD_PARTS, _PART_STYLES, strict=True):
@@ -92,16 +95,16 @@ def _draw_rewards(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_distance(axes: Axes, episode: Episode) -> None:
-    """The distance [T + 1] m to the goal, when it was reachable, and the refused moves."""
+    """The distance [T + 1] m to the goal, when the goal was reachable, and the refused moves."""
     times = np.arange(episode.num_steps + 1) * episode.time_step
     first = np.linalg.norm(episode.poses[0, :2] - episode.goal)
     distances = np.concatenate([[first], episode.goal_distances])
     high = 1.08 * float(distances.max())
     if episode.reachable.any():
-        # What is known after a step holds until after the next.
+        # A value measured after a step is shown until after the next step.
         shade = np.where(np.concatenate([[False], episode.reachable]), high, 0.0)
-        look: dict[str, Any] = {"step": "post", "color": COLORS[2], "alpha": 0.25, "lw": 0}
-        axes.fill_between(times, 0, shade, label="goal reachable", **look)
+        options: dict[str, Any] = {"step": "post", "color": COLORS[2], "alpha": 0.25, "lw": 0}
+        axes.fill_between(times, 0, shade, label="goal reachable", **options)
     axes.plot(times, distances, color=COLORS[0], lw=1.8, label="distance")
     axes.axhline(episode.goal_radius, color="0.45", lw=0.9, ls="--", label="goal radius")
     if episode.collisions.any():

@@ -71,7 +71,7 @@ def test_each_panel_has_its_noise_and_starts_without_any() -> None:
     ]
     bars = figure.axes[0].containers[0][2][0].get_segments()
     np.testing.assert_allclose(np.array(bars)[:, :, 1], [[0.8, 0.95], [0.5, 0.65]])
-    assert "share of full speed" in figure.axes[0].get_xlabel()
+    assert "fraction of full speed" in figure.axes[0].get_xlabel()
     with pytest.raises(ValueError, match="no results"):
         figures.robustness([], title="nothing")
 
