@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     try:
         code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
-        sys.stdout.flush()
+        _flush()
     except Interrupted as stop:
         print(f"\nsqn: {stop}", file=sys.stderr)
         code = stop.exit_code
@@ -57,10 +57,15 @@ def run() -> NoReturn:
     end_at_once()
     code = main()
     if code == 1 or code > 128:
-        sys.stdout.flush()
+        _flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _flush() -> None:
+    if sys.stdout is not None:  # It is None where a process is started without one.
+        sys.stdout.flush()
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -57,7 +57,7 @@ class EnvConfig:
     range_noise_unit: Literal["relative", "absolute"] = "relative"
     """Reading x (1 + U(-p, p)), or reading + max_range x U(-p, p)."""
     near_goal_fraction: float = 0.0
-    """Share of training tasks whose goal lies at one of the spawn points nearest to the start."""
+    """Fraction of training tasks whose goal is one of the spawn points nearest to the start."""
     reward_navigation: float = 2.0
     """Weight of the reachability-aware navigation term (paper eq. 9)."""
     reward_exploration: float = 1.0
@@ -233,7 +233,7 @@ class ExplorationConfig:
     epsilon_end: float = 0.1
     """Probability of a random action once it has fallen."""
     decay_fraction: float = 1.0
-    """Share of the run over which epsilon falls."""
+    """Fraction of the run over which epsilon falls."""
     ladder: bool = False
     """Give each parallel robot its own epsilon, evenly from 0 to 2 times the schedule's."""
 

@@ -118,23 +118,26 @@ def conclude(
         "num_devices": timing["num_devices"],
         "versions": {"sqn_jax": sqn_jax.__version__, "jax": jax.__version__},
     }
-    print(
-        f"trained in {_duration(summary['wall_seconds'])} "
-        f"({summary['steps_per_second']:,} steps a second)"
-    )
-    for entry in results:
-        tasks = entry["tasks"]
-        summary[tasks.replace(" ", "_")] = {
+    summary |= {
+        entry["tasks"].replace(" ", "_"): {
             "success": entry["success"]["mean"],
             "time_steps": entry["time_steps"]["mean"],
         }
+        for entry in results
+    }
+    # Before anything is printed: the reader of a pipe may have left.
+    folder.write_json("summary.json", summary)
+    print(
+        f"trained in {_duration(summary['wall_seconds'])} "
+        f"({summary['steps_per_second']:,} steps a second on average)"
+    )
+    for entry in results:
         low, high = entry["success"]["ci95"]
         print(
-            f"{tasks + ':':19} success {entry['success']['mean']:.2f} "
+            f"{entry['tasks'] + ':':19} success {entry['success']['mean']:.2f} "
             f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
             f"({config.eval.episodes} greedy episodes"
             + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
         )
-    folder.write_json("summary.json", summary)
     if has_figures:
         print(f"figures in {folder.figures}")
