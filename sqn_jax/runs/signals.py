@@ -56,19 +56,21 @@ def deferred(waiting_for: str) -> Iterator[list[int]]:
     terminals = [stream for stream in (1, 2) if os.isatty(stream)]
 
     def record(number: int, _: FrameType | None) -> None:
+        # Before anything else: another signal may come while this function runs.
+        received.append(number)
+        if len(received) == 1:
+            # Not for SIGHUP: a closing terminal may send it twice, and after Ctrl-C.
+            for stop in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(stop, handlers[stop])
         if number == signal.SIGHUP:
             # Writing to a closed terminal fails, and would prevent the run from saving.
             null_device = os.open(os.devnull, os.O_WRONLY)
             for stream in terminals:
                 os.dup2(null_device, stream)
             os.close(null_device)
-        if not received:
+        if len(received) == 1:
             with suppress(OSError):  # Not through `sys.stderr`, which may be in use.
                 os.write(2, f"\n{waiting_for}; once more to stop at once\n".encode())
-            # Not for SIGHUP: a closing terminal may send it twice, and after Ctrl-C.
-            for stop in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(stop, handlers[stop])
-        received.append(number)
 
     for number, handler in handlers.items():
         if number != signal.SIGHUP or handler != signal.SIG_IGN:
