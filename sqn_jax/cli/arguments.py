@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 from sqn_jax.config.map_names import parse
 
@@ -20,12 +21,19 @@ CACHE = (
 )
 
 
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?|\.[0-9]+(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)"
+
+
 class Parser(argparse.ArgumentParser):
     """Reports errors as a ValueError, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
         """Raise the message that argparse would print."""
         raise ValueError(message)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # Not that of argparse, which says nothing of a disk that is full.
+        print(message, end="", file=file)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -53,6 +61,20 @@ def checkpoint(argument: str) -> int | str:
     if argument.isascii() and argument.isdigit():
         return int(argument)
     raise argparse.ArgumentTypeError(f"is {argument}, expected newest, best or a number")
+
+
+def integer(argument: str) -> int:
+    """A whole number in plain digits; Python would also take `1_000`, and digits of any script."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,30}", argument):
+        raise argparse.ArgumentTypeError(f"is {argument!r}, expected an integer")
+    return int(argument)
+
+
+def number(argument: str) -> float:
+    """A number in plain digits; whether it may be infinite or none is for others to say."""
+    if not re.fullmatch(_NUMBER, argument, re.IGNORECASE):
+        raise argparse.ArgumentTypeError(f"is {argument!r}, expected a number")
+    return float(argument)
 
 
 def folder(argument: str) -> Path:

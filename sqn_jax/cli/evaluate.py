@@ -10,6 +10,8 @@ from sqn_jax.cli.arguments import (
     Parser,
     add_checkpoint,
     add_device,
+    integer,
+    number,
     single_maps,
 )
 from sqn_jax.config.presets import PAPER_MAPS
@@ -32,19 +34,19 @@ def evaluate(arguments: list[str]) -> int:
     )
     add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
     add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
-    add("--episodes", type=int, default=100, help="per evaluation seed (default 100)")
-    add("--eval-seeds", type=int, default=5, help="number of evaluation seeds (default 5)")
-    add("--seed", type=int, default=1_000, help="the first evaluation seed (default 1000)")
-    add("--velocity-noise", nargs="+", type=float, default=[], metavar="S", help="e.g. 0.1 0.2")
-    add("--range-noise", nargs="+", type=float, default=[], metavar="P", help="e.g. 0.2 0.4")
+    add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
+    add("--eval-seeds", type=integer, default=5, help="number of evaluation seeds (default 5)")
+    add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
+    add("--velocity-noise", nargs="+", type=number, default=[], metavar="S", help="e.g. 0.1 0.2")
+    add("--range-noise", nargs="+", type=number, default=[], metavar="P", help="e.g. 0.2 0.4")
     add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
     add(
         "--max-steps",
-        type=int,
+        type=integer,
         default=0,
         help="steps per episode (default: each map's limit)",
     )
-    add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
+    add("--goal-radius", nargs="+", type=number, default=[0.3, 0.5], metavar="M", help="m")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
     add_device(parser)

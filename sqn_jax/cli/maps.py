@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqn_jax.cli.arguments import Parser
+from sqn_jax.cli.arguments import Parser, number
 from sqn_jax.config.map_names import parse
 
 
@@ -11,7 +11,7 @@ def check_map(arguments: list[str]) -> int:
     parser = Parser(prog="sqn map", description="Check maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
     parser.add_argument("file", help="a file, a map of the project by name, or maze:7, maze:0-3")
-    parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
+    parser.add_argument("--robot-radius", type=number, default=0.1, help="m (default 0.1)")
     parser.add_argument(
         "--allow-outside",
         action="store_true",

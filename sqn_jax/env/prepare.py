@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env.arithmetic import LARGEST_INTEGER
+from sqn_jax.env.arithmetic import LARGEST_INTEGER, require_single_precision
 from sqn_jax.env.coverage import Lattice
 from sqn_jax.env.free_space import far_sides, free_rectangles
 from sqn_jax.env.params import EnvParams
@@ -61,13 +61,15 @@ def make_env(
         The parameters that `reset` and `step` take.
 
     Raises:
-        ValueError: the map is unusable; the message names the file and what was expected.
+        ValueError: the map is unusable; the message names the file and what was expected. Or JAX
+            is set to double precision.
 
     Example:
         >>> params = make_env("maze")
         >>> params.max_steps
         400
     """
+    require_single_precision()
     config = EnvConfig() if config is None else config
     if spawn not in ("training", "evaluation"):
         raise ValueError(f"spawn is {spawn!r}, expected training or evaluation")

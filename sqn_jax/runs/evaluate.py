@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from sqn_jax.evaluation.agents import Agent
-from sqn_jax.evaluation.compare import OnEvaluated, evaluate_agents, load_maps, num_episodes
+from sqn_jax.evaluation.compare import (
+    OnEvaluated,
+    evaluate_agents,
+    load_maps,
+    memory_bytes,
+    num_episodes,
+)
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import write_json, write_records
+from sqn_jax.training import memory_budget
 
 
 @cached_programs()
@@ -35,9 +42,12 @@ def evaluate_session(
         The contents of the evaluation file.
 
     Raises:
-        ValueError: a map is unusable for a robot; nothing has been run.
+        ValueError: a map is unusable for a robot, or the episodes do not fit into memory; nothing
+            has been run.
     """
     maps = load_maps(agents, settings)
+    needed = memory_bytes(agents, maps, settings, fields)
+    memory_budget.require(needed, "keeping the episodes", "evaluate")
     with episodes_bar(num_episodes(agents, settings)) as bar:
         evaluation, records = evaluate_agents(
             agents, maps, settings, bar.update, on_evaluated, fields

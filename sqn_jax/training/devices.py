@@ -53,6 +53,7 @@ def require(kind: str | None) -> None:
     Raises:
         ValueError: there is none of this kind, or none that JAX may use.
     """
+    _use_own_modes()
     if kind == "cpu":
         jax.config.update("jax_platforms", "cpu")
     try:
@@ -68,6 +69,18 @@ def require(kind: str | None) -> None:
             "(pip install 'jax[cuda12]')",
             file=sys.stderr,
         )
+
+
+_MODES = {"jax_enable_x64": False, "jax_numpy_dtype_promotion": "standard"}
+"""What decides about types, as all programs here expect it."""
+
+
+def _use_own_modes() -> None:
+    """Say and change what the environment has set for the programs of others."""
+    for name, expected in _MODES.items():
+        if (value := getattr(jax.config, name)) != expected:
+            jax.config.update(name, expected)
+            print(f"{name.upper()} is {value}, used is {expected}", file=sys.stderr)
 
 
 def _has_nvidia() -> bool:

@@ -119,7 +119,7 @@ def test_own_options_reach_the_run(
     assert main(["train", "--map", "x_y/my_map.yaml,maze:0-2", "--tensorboard"]) == 0
     config, run_dir, given = started.pop()
     assert config.map == "x_y/my_map.yaml,maze:0-2"
-    assert re.fullmatch(r"runs/[\d_-]+_sqn_my_map_maze_0-2_quick", str(run_dir))
+    assert re.fullmatch(r"runs/[\d_-]+_sqn_my_map_maze_0-2_quick_seed0", str(run_dir))
     assert given.tensorboard
     assert main(["train", "--preset", "best", "--seed=3", "--seed", "4"]) == 0
     assert started.pop()[0] == dataclasses.replace(PRESETS["best"], seed=4)
