@@ -3,7 +3,7 @@
 It only passes arguments to functions.
 
 Exit codes: 0 success, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
-143 and 129 in a shell: stopped by SIGINT, SIGTERM or SIGHUP. If there is something to save, it is
+143, 129 and 141 in a shell: stopped by SIGINT, SIGTERM, SIGHUP or a reader that left. If there is something to save, it is
 saved first. If not, the signal itself ends the process at once; Python's `subprocess` reports this
 as -2, -15 and -1.
 """
@@ -11,7 +11,9 @@ as -2, -15 and -1.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from typing import NoReturn
@@ -24,16 +26,13 @@ from sqn_jax.cli.train import train
 from sqn_jax.runs import streams
 from sqn_jax.runs.signals import Interrupted, end_at_once
 
-USAGE = """usage: sqn COMMAND [OPTIONS]
-
-  sqn train              train a robot, evaluate it, and draw what it did
-  sqn evaluate RUN ...   compare trained robots and baselines on any maps, with noise
-  sqn report RUN ...     the same as a page with pictures, the worst episodes first
-  sqn render RUN ...     animations and pictures of what trained robots do on a map
-  sqn map check FILE     describe a map, or say what is wrong with it
-
-`sqn COMMAND --help` lists the options of a command, `sqn --version` prints the version.
-"""
+_SUMMARIES = {
+    "train": "train a robot, evaluate it, and draw what it did",
+    "evaluate RUN ...": "compare trained robots and baselines on any maps, with noise",
+    "report RUN ...": "the same as a page with pictures, the worst episodes first",
+    "render RUN ...": "animations and pictures of what trained robots do on a map",
+    "map check FILE": "describe a map, or say what is wrong with it",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,7 +63,7 @@ def run() -> NoReturn:
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE, end="")
+        print(_usage())
         return 0 if arguments else 2
     if arguments[0] == "--version":
         print(f"sqn {__version__}")
@@ -89,6 +88,22 @@ def _dispatch(arguments: list[str]) -> int:
         return code
     except FloatingPointError as error:  # The run has diverged.
         return _fail(str(error))
+
+
+def _usage() -> str:
+    """The commands, in lines that fit the terminal."""
+    width = shutil.get_terminal_size().columns
+    ends = (
+        "`sqn COMMAND --help` lists the options of a command, `sqn --version` prints the version."
+    )
+    indent = " " * 25
+    commands = [
+        textwrap.fill(f"{'  sqn ' + name:25}{summary}", width, subsequent_indent=indent)
+        for name, summary in _SUMMARIES.items()
+    ]
+    return "\n".join(
+        ["usage: sqn COMMAND [OPTIONS]", "", *commands, "", textwrap.fill(ends, width)]
+    )
 
 
 def _refuse(message: str) -> int:

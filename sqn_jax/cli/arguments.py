@@ -81,6 +81,8 @@ def folder(argument: str) -> Path:
     """The path of a folder."""
     if not argument.strip():
         raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
+    if any("\ud800" <= sign <= "\udfff" for sign in argument):
+        raise argparse.ArgumentTypeError(f"is {argument!a}, expected a name in UTF-8")
     return Path(argument)
 
 

@@ -15,6 +15,7 @@ from sqn_jax.cli.arguments import (
     single_maps,
 )
 from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.runs import streams
 
 
 def evaluate(arguments: list[str]) -> int:
@@ -33,7 +34,14 @@ def evaluate(arguments: list[str]) -> int:
         help="run folders, pretrained:NAME or files NAME.npz; default: only the baselines",
     )
     add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
-    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add(
+        "--tasks",
+        nargs="+",
+        choices=list(TASKS),
+        default=["points"],
+        metavar="TASKS",
+        help="points, pairs or both (default: points)",
+    )
     add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
     add("--eval-seeds", type=integer, default=5, help="number of evaluation seeds (default 5)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
@@ -75,7 +83,9 @@ def evaluate(arguments: list[str]) -> int:
         goal_radii=tuple(options.goal_radius),
         max_steps=options.max_steps,
     )
-    if options.out is not None:
+    if options.out is None:
+        streams.require_output("--out FILE for the results")
+    else:
         _require_writable(options.out)
     trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
     agents = with_baselines(trained, baselines=not options.no_references)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sqn_jax.cli.arguments import Parser, number
 from sqn_jax.config.map_names import parse
+from sqn_jax.config.validation import LIMITS, require_limits
 
 
 def check_map(arguments: list[str]) -> int:
@@ -18,6 +19,7 @@ def check_map(arguments: list[str]) -> int:
         help="let the YAML file name an image that lies outside its folder",
     )
     options = parser.parse_args(arguments)
+    require_limits(options.robot_radius, "--robot-radius", *LIMITS["env.robot_radius"])
     from sqn_jax.maps import load_map
     from sqn_jax.maps.check import describe
 

@@ -29,7 +29,14 @@ def report(arguments: list[str]) -> int:
     add = parser.add_argument
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--maps", nargs="+", help="names or files (default: the map of the first run)")
-    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
+    add(
+        "--tasks",
+        nargs="+",
+        choices=list(TASKS),
+        default=["points"],
+        metavar="TASKS",
+        help="points, pairs or both (default: points)",
+    )
     add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
     add("--eval-seeds", type=integer, default=1, help="number of evaluation seeds (default 1)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")

@@ -58,8 +58,10 @@ _SWITCHES = [name for name, value in _DEFAULTS.items() if isinstance(value, bool
 def _parser() -> Parser:
     parser = Parser(
         prog="sqn train",
-        usage="sqn train [--preset NAME] [--run-dir DIR] [--SETTING VALUE ...]\n"
-        "       sqn train --resume --run-dir DIR [--total-episodes N] [--map FILE]",
+        usage="sqn train [--preset NAME] [--run-dir DIR]\n"
+        "                 [--SETTING VALUE ...]\n"
+        "       sqn train --resume --run-dir DIR\n"
+        "                 [--total-episodes N] [--map FILE]",
         description="Train an agent, evaluate it, and draw what it did.",
         epilog=CACHE,
         formatter_class=_formatter,

@@ -30,7 +30,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "env.backward_speed": (0, 1e6),
     "env.turn_rate": (0, 1e6),
     "env.time_step": (1e-6, 1e6),
-    "env.robot_radius": (0, 1e6),
+    "env.robot_radius": (0, 100),
     "env.reward_navigation": (-1e6, 1e6),
     "env.reward_exploration": (-1e6, 1e6),
     "env.reward_time": (-1e6, 1e6),

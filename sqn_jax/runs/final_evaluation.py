@@ -19,7 +19,6 @@ from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices, memory_budget
 from sqn_jax.training.state import RunnerState
 
-
 FIELDS = ("output",)
 """What the figures need of the steps, beside the poses."""
 

@@ -24,6 +24,8 @@ class Stream(io.TextIOWrapper):
 
     error: OSError | None = None
     """The first error; None while there was none."""
+    was_closed = False
+    """Whether there was nowhere to write to from the start."""
 
     def write(self, text: str) -> int:
         """Write a text, or discard it."""
@@ -58,6 +60,16 @@ def install() -> None:
         except OSError:
             _open_null(descriptor)
     sys.stdout, sys.stderr = _wrapped(sys.stdout, 1), _wrapped(sys.stderr, 2)
+
+
+def require_output(instead: str) -> None:
+    """Refuse to compute what is only printed where standard output is closed.
+
+    Raises:
+        ValueError: it is; the message says what to give instead.
+    """
+    if sys.stdout is None or (isinstance(sys.stdout, Stream) and sys.stdout.was_closed):
+        raise ValueError(f"standard output is closed, expected {instead}")
 
 
 def reader_left() -> bool:
@@ -96,7 +108,9 @@ def _wrapped(stream: TextIO | None, descriptor: int) -> Stream:
         stream.flush()
         encoding, is_by_line = stream.encoding, stream.isatty() or is_by_line
     buffer = io.BufferedWriter(io.FileIO(descriptor, "w", closefd=False))
-    return Stream(buffer, encoding, "stand-ins", line_buffering=is_by_line)
+    wrapped = Stream(buffer, encoding, "stand-ins", line_buffering=is_by_line)
+    wrapped.was_closed = stream is None
+    return wrapped
 
 
 def _stand_in(error: UnicodeError) -> tuple[str, int]:
