@@ -3,9 +3,9 @@
 It only passes arguments to functions.
 
 Exit codes: 0 success, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
-143, 129 and 141 in a shell: stopped by SIGINT, SIGTERM, SIGHUP or a reader that left. If there is something to save, it is
-saved first. If not, the signal itself ends the process at once; Python's `subprocess` reports this
-as -2, -15 and -1.
+143, 129 and 141 in a shell: stopped by SIGINT, SIGTERM, SIGHUP or a reader that left. If there is
+something to save, it is saved first. If not, the signal itself ends the process at once; Python's
+`subprocess` reports this as -2, -15 and -1.
 """
 
 from __future__ import annotations
