@@ -71,8 +71,13 @@ def require(kind: str | None) -> None:
         )
 
 
-_MODES = {"jax_enable_x64": False, "jax_numpy_dtype_promotion": "standard"}
-"""What decides about types, as all programs here expect it."""
+_MODES = {
+    "jax_enable_x64": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+}
+"""What all programs here expect: single precision, and NaN for what is not known yet."""
 
 
 def _use_own_modes() -> None:

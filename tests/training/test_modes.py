@@ -1,4 +1,4 @@
-"""JAX's modes that decide about types: of no effect on commands, refused in one line elsewhere."""
+"""JAX's modes that programs here do not expect: of no effect on commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from sqn_jax.env import make_env
 from sqn_jax.env.arithmetic import to_integer
 from sqn_jax.training import devices
 
-MODES = {"jax_enable_x64": (False, True), "jax_numpy_dtype_promotion": ("standard", "strict")}
+MODES = {
+    "jax_enable_x64": (False, True),
+    "jax_numpy_dtype_promotion": ("standard", "strict"),
+    "jax_debug_nans": (False, True),
+    "jax_debug_infs": (False, True),
+}
 
 
 @pytest.fixture(autouse=True)
