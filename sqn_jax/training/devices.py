@@ -58,8 +58,9 @@ def require(kind: str | None) -> None:
         jax.config.update("jax_platforms", "cpu")
     try:
         backend = jax.devices()[0].platform
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
+    except Exception as error:  # JAX also fails by assertions, which say nothing.
+        chosen = f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}"
+        reason = " ".join(str(error).split())[:200] or chosen
         raise ValueError(f"JAX finds no device as it is set up here ({reason})") from None
     if kind is not None and backend != kind:
         raise ValueError(f"--device is {kind}, expected one that JAX finds here: {backend}")
@@ -76,8 +77,9 @@ _MODES = {
     "jax_numpy_dtype_promotion": "standard",
     "jax_debug_nans": False,
     "jax_debug_infs": False,
+    "jax_disable_jit": False,
 }
-"""What all programs here expect: single precision, and NaN for what is not known yet."""
+"""What all programs here expect: single precision, NaN for what is not known yet, compilation."""
 
 
 def _use_own_modes() -> None:

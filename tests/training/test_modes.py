@@ -17,6 +17,7 @@ MODES = {
     "jax_numpy_dtype_promotion": ("standard", "strict"),
     "jax_debug_nans": (False, True),
     "jax_debug_infs": (False, True),
+    "jax_disable_jit": (False, True),
 }
 
 
@@ -46,3 +47,15 @@ def test_double_precision_is_refused_in_one_line() -> None:
             with pytest.raises(ValueError, match=r"\Ajax_enable_x64 is on, expected it off: .*\Z"):
                 compute()
     assert to_integer(jnp.zeros(1)).dtype == jnp.int32
+
+
+def test_a_kind_of_device_that_jax_fails_to_find_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail() -> None:
+        raise AssertionError
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr(jax, "devices", fail)
+    with pytest.raises(ValueError, match=r"finds no device .*\(JAX_PLATFORMS is 'cuda'\)\Z"):
+        devices.require(None)
