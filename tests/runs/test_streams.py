@@ -12,7 +12,7 @@ from sqn_jax.runs import streams
 
 # Prints to both, then opens a file as a run does, and says what became of it in that file.
 PROGRAM = """
-import signal, sys
+import os, signal, sys
 from sqn_jax.runs import streams
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 streams.install()
@@ -21,6 +21,9 @@ for _ in range(2):
     print("progress", file=sys.stderr, flush=True)
     sys.stdout.flush()
 left = streams.reader_left()
+for stream in (sys.stdout, sys.stderr):
+    if stream.error:  # What follows, of libraries too, goes to the null device.
+        assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))
 with open(sys.argv[1], "w") as file:
     file.write(f"{file.fileno()} {streams.failure()!r} {left}")
 """
