@@ -17,7 +17,7 @@ LARGEST, SMALLEST = 1e30, 1e-30
 """Of other numbers, and of those above 0: what single precision holds."""
 
 LIMITS: dict[str, tuple[float, float]] = {
-    "env.num_beams": (2, 10_000),
+    "env.num_beams": (2, 4096),
     "env.field_of_view_deg": (0.1, 360),
     "env.max_steps": (0, 100_000),  # More would not fit into memory.
     "env.goal_radius": (1e-6, 1e6),

@@ -139,6 +139,13 @@ def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
             f"{config.coverage_cell:g} m are {points:,.0f} points to count the covered area on, "
             f"expected at most {MAX_LATTICE_POINTS:,}: a smaller map or a larger env.coverage_cell"
         )
+    lattice = Lattice.over(height_m, width_m, config.coverage_cell, config.max_range)
+    if 32 * math.prod(lattice.shape) > 8 * MAX_LATTICE_POINTS:
+        raise ValueError(
+            f"env.max_range is {config.max_range:g} m with env.coverage_cell "
+            f"{config.coverage_cell:g} m, expected at most that of the map {name}, "
+            f"{math.hypot(width_m, height_m):,.0f} m"
+        )
     reach = occupancy_map.spawn_radius / occupancy_map.resolution + 1
     places = len(occupancy_map.spawn_points) * min(math.pi * reach**2, height * width)
     if places > MAX_SPAWN_PLACES:
