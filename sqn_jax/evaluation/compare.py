@@ -31,7 +31,7 @@ def num_episodes(agents: Sequence[Agent], settings: Settings) -> int:
     return num_worlds * num_policies * settings.eval_seeds * settings.episodes
 
 
-RECORD_BYTES = 2_000
+RECORD_BYTES = 1_000
 """What the record of an episode takes until it is written."""
 
 
