@@ -20,46 +20,7 @@ from sqn_jax.runs import streams
 
 def evaluate(arguments: list[str]) -> int:
     """Evaluate policies and baselines, and print a table."""
-    parser = Parser(
-        prog="sqn evaluate",
-        description="Run greedy episodes of trained policies; all agents get the same tasks.",
-        epilog=CACHE,
-        allow_abbrev=False,
-    )
-    add = parser.add_argument
-    add(
-        "runs",
-        nargs="*",
-        metavar="RUN",
-        help="run folders, pretrained:NAME or files NAME.npz; default: only the baselines",
-    )
-    add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
-    add(
-        "--tasks",
-        nargs="+",
-        choices=list(TASKS),
-        default=["points"],
-        metavar="TASKS",
-        help="points, pairs or both (default: points)",
-    )
-    add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
-    add("--eval-seeds", type=integer, default=5, help="number of evaluation seeds (default 5)")
-    add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
-    add("--velocity-noise", nargs="+", type=number, default=[], metavar="S", help="e.g. 0.1 0.2")
-    add("--range-noise", nargs="+", type=number, default=[], metavar="P", help="e.g. 0.2 0.4")
-    add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
-    add(
-        "--max-steps",
-        type=integer,
-        default=0,
-        help="steps per episode (default: each map's limit)",
-    )
-    add("--goal-radius", nargs="+", type=number, default=[0.3, 0.5], metavar="M", help="m")
-    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
-    add_checkpoint(parser)
-    add_device(parser)
-    add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     if not options.runs and options.no_references:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax.evaluation.agents import group_policies, with_baselines
@@ -100,6 +61,49 @@ def evaluate(arguments: list[str]) -> int:
     if options.out is not None:
         print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
     return 0
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="sqn evaluate",
+        description="Run greedy episodes of trained policies; all agents get the same tasks.",
+        epilog=CACHE,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help="run folders, pretrained:NAME or files NAME.npz; default: only the baselines",
+    )
+    add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
+    add(
+        "--tasks",
+        nargs="+",
+        choices=list(TASKS),
+        default=["points"],
+        metavar="TASKS",
+        help="points, pairs or both (default: points)",
+    )
+    add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
+    add("--eval-seeds", type=integer, default=5, help="number of evaluation seeds (default 5)")
+    add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
+    add("--velocity-noise", nargs="+", type=number, default=[], metavar="S", help="e.g. 0.1 0.2")
+    add("--range-noise", nargs="+", type=number, default=[], metavar="P", help="e.g. 0.2 0.4")
+    add("--noise-unit", choices=["relative", "absolute"], help="default: as trained")
+    add(
+        "--max-steps",
+        type=integer,
+        default=0,
+        help="steps per episode (default: each map's limit)",
+    )
+    add("--goal-radius", nargs="+", type=number, default=[0.3, 0.5], metavar="M", help="m")
+    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add_checkpoint(parser)
+    add_device(parser)
+    add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")
+    return parser
 
 
 def _require_writable(path: Path) -> None:
