@@ -58,9 +58,10 @@ def require(kind: str | None) -> None:
         jax.config.update("jax_platforms", "cpu")
     try:
         backend = jax.devices()[0].platform
-    except Exception as error:  # JAX also fails by assertions, which say nothing.
-        chosen = f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}"
-        reason = " ".join(str(error).split())[:200] or chosen
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        if not isinstance(error, RuntimeError):  # An assertion of JAX says nothing.
+            reason = f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}"
         raise ValueError(f"JAX finds no device as it is set up here ({reason})") from None
     if kind is not None and backend != kind:
         raise ValueError(f"--device is {kind}, expected one that JAX finds here: {backend}")
