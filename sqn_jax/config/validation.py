@@ -81,7 +81,9 @@ def require_within_limits(config: object, group: str) -> None:
 
 def require_limits(value: float, name: str, least: float, most: float) -> None:
     """Check that a number lies between two, both included."""
-    require(least <= value <= most, name, value, f"{_text(least)} to {_text(most)}")
+    require(
+        least <= value <= most, name, value, f"at least {_text(least)} and at most {_text(most)}"
+    )
 
 
 def _text(value: float) -> str:
