@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import difflib
 import re
-import shlex
 import shutil
 import time
 from pathlib import Path
@@ -140,25 +139,23 @@ def _default_run_dir(config: TrainConfig, preset: str) -> Path:
 
 def _run_training(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> int:
     from sqn_jax.runs.train import train_session
+    from sqn_jax.storage.run_folder import resume_command
     from sqn_jax.training import devices
 
     devices.use_cores()
     devices.require(options.device)
     config = _with_absolute_paths(config)
-    command = f"sqn train --run-dir {shlex.quote(str(run_dir))} --resume"
-    for name in (
-        "device",
-        "num_devices",
-    ):  # With others the results would differ.
+    same = ""
+    for name in ("device", "num_devices"):  # With others the results would differ.
         value = getattr(options, name)
-        command += "" if value is None else f" --{name.replace('_', '-')} {value}"
+        same += "" if value is None else f" --{name.replace('_', '-')} {value}"
     train_session(
         config,
         run_dir,
         resume=options.resume,
         num_devices=options.num_devices,
         tensorboard=options.tensorboard,
-        resume_command=f"`{command}`",
+        resume_command=f"`{resume_command(run_dir, same)}`",
     )
     return 0
 

@@ -22,6 +22,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from tqdm import tqdm
 
+from sqn_jax.outside.messages import say, shown
 from sqn_jax.storage.files import probe_writable
 
 VARIABLE = "SQN_JAX_CACHE"
@@ -109,7 +110,7 @@ def _open_folder(chosen: str) -> Path | None:
         fault = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except RuntimeError as error:  # Nobody's home.
         fault = str(error)
-    print(f"compiled programs are not kept: {fault}", file=sys.stderr)
+    say(f"compiled programs are not kept: {fault}", error=True)
     return None
 
 
@@ -146,8 +147,7 @@ def _tidy(folder: Path) -> None:
             entry.unlink(missing_ok=True)
             seal.unlink(missing_ok=True)
     if damaged:
-        message = f"compiled programs in {folder}: {damaged} damaged, to be compiled again"
-        print(message, file=sys.stderr)
+        say(f"compiled programs in {folder}: {damaged} damaged, to be compiled again", error=True)
 
 
 @contextmanager
@@ -194,7 +194,8 @@ def _warnings_in_one_line(folder: Path) -> Iterator[None]:
             if verb not in troubles:
                 failure = f"{verb} {program} failed ({' '.join(reason.split())})"
                 # Through tqdm, since a progress bar may be on the screen.
-                tqdm.write(f"compiled programs in {folder}: {failure}; going on", file=sys.stderr)
+                message = shown(f"compiled programs in {folder}: {failure}; going on")
+                tqdm.write(message, file=sys.stderr)
             troubles.add(verb)
 
         warnings.showwarning = show
