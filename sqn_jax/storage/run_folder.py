@@ -48,6 +48,10 @@ OWN_NAMES = ("config", "evaluation", "metrics", "summary")
 MAX_JSON_BYTES = 2**20
 """Size of config.json and summary.json at most; they have a few kilobytes."""
 
+_MISREAD = "\\*?["
+"""Characters that the libraries for checkpoints take for separators or patterns, and then lose or
+mix up files without a word."""
+
 _FOLDERS = (CHECKPOINTS, "figures", "tensorboard")
 _FILES = (
     *(CONFIG, METRICS, SUMMARY, "evaluation.json", "evaluation.jsonl"),
@@ -61,14 +65,16 @@ def require_usable(path: Path) -> None:
     The folder itself may be a symbolic link, what a run keeps in it may not.
 
     Raises:
-        ValueError: its path holds a backslash, which the library for checkpoints takes for a
-            separator, or what cannot be printed; or a file of the run is none of its own.
+        ValueError: its path holds what the libraries for checkpoints misread, or what cannot be
+            printed; or a file of the run is none of its own.
     """
-    odd = [letter for letter in str(path.absolute()) if letter == "\\" or not letter.isprintable()]
+    place = path.absolute()
+    odd = [letter for letter in str(place) if letter in _MISREAD or not letter.isprintable()]
+    odd += [part for part in place.parts if part.endswith(":")]
     if odd:
         raise ValueError(
-            f"run folder {named(path)}: its path holds {odd[0]!r}, expected a path without "
-            "backslashes and with nothing that cannot be printed"
+            f"run folder {named(path)}: its path holds {odd[0]!r}, expected one without {_MISREAD}, "
+            "without a colon at the end of a name, and with nothing that cannot be printed"
         )
     try:
         for name in _FILES:
