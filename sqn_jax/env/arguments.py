@@ -5,6 +5,8 @@ Types and shapes are known under `jit` and `vmap` too; numbers are known outside
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,18 +48,18 @@ def require_state(state: object) -> None:
         )
 
 
-def require_action(action: object, count: int) -> None:
+def require_action(action: Any, count: int) -> None:
     """Refuse an action that is no whole number, or none from 0 to `count` - 1."""
     try:
-        shape, dtype = np.shape(action), jnp.result_type(action)
-    except (TypeError, ValueError):
-        shape, dtype = None, None
-    if shape != () or not jnp.issubdtype(dtype, jnp.integer):
+        is_number = np.shape(action) == () and jnp.issubdtype(jnp.result_type(action), jnp.integer)
+    except (TypeError, ValueError, OverflowError):
+        is_number = False
+    if not is_number:
         raise ValueError(
             f"action is {_described(action)}, expected one whole number from 0 to {count - 1}"
         )
-    if not _is_traced(action) and not 0 <= int(action) < count:  # type: ignore[call-overload]
-        raise ValueError(f"action is {int(action)}, expected 0 to {count - 1}")  # type: ignore[call-overload]
+    if not _is_traced(action) and not 0 <= int(action) < count:
+        raise ValueError(f"action is {int(action)}, expected 0 to {count - 1}")
 
 
 def require_place(name: str, place: object, size: int, params: EnvParams) -> Array:

@@ -100,7 +100,8 @@ def step(
     Args:
         key: consumed; only used for noise.
         state: where the robot is.
-        action: integer in 0..4.
+        action: integer in 0..4. Where it is traced (under `jit`, `vmap`, `scan`) it cannot be
+            refused: what is above 4 acts as 4, what is negative counts from the end, -1 as 4.
         params: from `make_env`.
 
     Returns:
@@ -108,6 +109,10 @@ def step(
         (goal within `goal_radius`), `collision` (a refused move), `goal_distance` m,
         `covered_area` m2 newly seen, and the unweighted reward terms `reward_navigation`,
         `reward_exploration`, `reward_time`.
+
+    Raises:
+        ValueError: the action is known and none of 0..4, or an argument is of another kind or
+            shape than that of one robot.
     """
     require_key(key)
     require_params(params)

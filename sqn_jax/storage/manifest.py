@@ -184,7 +184,11 @@ def _contents(folder: Path) -> dict[str, Any]:
     except ValueError:
         raise Damaged(f"{NAME} is not what was written") from None
     contents = entry.get("contents") if isinstance(entry, dict) else None
-    if not isinstance(contents, dict) or entry.get("sha256") != _contents_digest(contents):
+    if (
+        entry is None
+        or not isinstance(contents, dict)
+        or entry.get("sha256") != _contents_digest(contents)
+    ):
         raise Damaged(f"{NAME} is not what was written")
     if contents.get("schema") != SCHEMA:
         raise ValueError(

@@ -73,8 +73,8 @@ def require_usable(path: Path) -> None:
     odd += [part for part in place.parts if part.endswith(":")]
     if odd:
         raise ValueError(
-            f"run folder {named(path)}: its path holds {odd[0]!r}, expected one without {_MISREAD}, "
-            "without a colon at the end of a name, and with nothing that cannot be printed"
+            f"run folder {named(path)}: its path holds {odd[0]!r}, expected one without any "
+            f"of {_MISREAD}, without a colon at the end of a name, and with nothing that cannot be printed"
         )
     try:
         for name in _FILES:
