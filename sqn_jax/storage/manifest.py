@@ -183,7 +183,8 @@ def _contents(folder: Path) -> dict[str, Any]:
         raise Damaged(f"{NAME} cannot be read ({error.strerror})") from None
     except ValueError:
         raise Damaged(f"{NAME} is not what was written") from None
-    contents = entry.get("contents") if isinstance(entry, dict) else None
+    entry = {"sha256": None, **entry} if isinstance(entry, dict) else {}
+    contents = entry.get("contents")
     if (
         entry is None
         or not isinstance(contents, dict)

@@ -74,7 +74,8 @@ def require_usable(path: Path) -> None:
     if odd:
         raise ValueError(
             f"run folder {named(path)}: its path holds {odd[0]!r}, expected one without any "
-            f"of {_MISREAD}, without a colon at the end of a name, and with nothing that cannot be printed"
+            f"of {_MISREAD}, without a colon at the end of a name, and with nothing that cannot be "
+            "printed"
         )
     try:
         for name in _FILES:

@@ -106,7 +106,7 @@ def test_a_file_larger_than_expected_is_not_read(tmp_path: Path) -> None:
 
 
 ROWS = [{"chunk": n, "episodes": 4 * n, "loss": None, "usage": [0.5, 0.5]} for n in (1, 2, 3, 4)]
-CONFIG = TrainConfig(num_envs=4, total_episodes=16, rounds_per_chunk=1, method="pqn")
+CONFIG = TrainConfig(num_envs=4, total_episodes=16, rounds_per_chunk=1)
 
 
 @pytest.mark.parametrize(
