@@ -185,11 +185,7 @@ def _contents(folder: Path) -> dict[str, Any]:
         raise Damaged(f"{NAME} is not what was written") from None
     entry = {"sha256": None, **entry} if isinstance(entry, dict) else {}
     contents = entry.get("contents")
-    if (
-        entry is None
-        or not isinstance(contents, dict)
-        or entry.get("sha256") != _contents_digest(contents)
-    ):
+    if not isinstance(contents, dict) or entry.get("sha256") != _contents_digest(contents):
         raise Damaged(f"{NAME} is not what was written")
     if contents.get("schema") != SCHEMA:
         raise ValueError(
