@@ -23,6 +23,7 @@ from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
 from sqn_jax.cli.train import train
+from sqn_jax.outside.messages import say, say_lines
 from sqn_jax.runs import streams
 from sqn_jax.runs.signals import Interrupted, end_at_once
 
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _dispatch(list(sys.argv[1:] if arguments is None else arguments))
     except Interrupted as stop:
-        print(f"\nsqn: {stop}", file=sys.stderr)
+        say(f"sqn: {stop}", start="\n", error=True)
         return stop.exit_code
 
 
@@ -63,10 +64,10 @@ def run() -> NoReturn:
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_usage())
+        say_lines(_usage().splitlines())
         return 0 if arguments else 2
     if arguments[0] == "--version":
-        print(f"sqn {__version__}")
+        say(f"sqn {__version__}")
         return 0
     name, *command_arguments = arguments
     command = _COMMANDS.get(name)
@@ -84,7 +85,7 @@ def _dispatch(arguments: list[str]) -> int:
     except ValueError as error:
         code = _refuse(str(error))
         if table := getattr(error, "table", ""):
-            print(table, file=sys.stderr)
+            say_lines(table.split("\n"), error=True)
         return code
     except FloatingPointError as error:  # The run has diverged.
         return _fail(str(error))
@@ -107,7 +108,7 @@ def _usage() -> str:
 
 
 def _refuse(message: str) -> int:
-    print(f"sqn: {' '.join(message.split())}", file=sys.stderr)
+    say(f"sqn: {' '.join(message.split())}", error=True)
     return 2
 
 
@@ -117,7 +118,7 @@ def _fail(message: str) -> int:
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:
-    print(f"sqn: warning: {message}", file=sys.stderr)
+    say(f"sqn: warning: {message}", error=True)
 
 
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {

@@ -15,6 +15,7 @@ from sqn_jax.cli.arguments import (
     single_maps,
 )
 from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.outside.messages import say, say_lines
 from sqn_jax.runs import streams
 
 
@@ -51,15 +52,15 @@ def evaluate(arguments: list[str]) -> int:
     trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
     agents = with_baselines(trained, baselines=not options.no_references)
     evaluation = evaluate_session(agents, settings, options.out)
-    print(results_table(evaluation["results"]))
+    say_lines(results_table(evaluation["results"]).split("\n"))
     for comparison in evaluation["comparisons"]:
         low, high = comparison["ci95"]
-        print(
+        say(
             f"{comparison['first']} beats {comparison['second']} with probability "
             f"{comparison['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
         )
     if options.out is not None:
-        print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
+        say(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
     return 0
 
 
@@ -107,7 +108,7 @@ def _parser() -> Parser:
 
 
 def _require_writable(path: Path) -> None:
-    from sqn_jax.storage.files import probe_writable
+    from sqn_jax.storage.files import NotWritten, probe_file
     from sqn_jax.storage.run_folder import CONFIG, OWN_NAMES
 
     if path.suffix != ".json":
@@ -117,7 +118,8 @@ def _require_writable(path: Path) -> None:
         raise ValueError(f"--out {path}: expected a file in an existing folder")
     if (path.parent / CONFIG).is_file() and path.stem in OWN_NAMES:
         raise ValueError(f"--out {path}: is a file of that run itself, expected another name")
-    try:
-        probe_writable(path.parent)
-    except OSError as error:
-        raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
+    for file in (path, records):
+        try:
+            probe_file(file)
+        except NotWritten as error:
+            raise ValueError(f"--out {error}") from None

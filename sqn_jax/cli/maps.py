@@ -5,6 +5,7 @@ from __future__ import annotations
 from sqn_jax.cli.arguments import Parser, number
 from sqn_jax.config.map_names import parse
 from sqn_jax.config.validation import LIMITS, require_limits
+from sqn_jax.outside.messages import say, say_lines
 
 
 def check_map(arguments: list[str]) -> int:
@@ -27,5 +28,7 @@ def check_map(arguments: list[str]) -> int:
         occupancy_map = load_map(
             name, robot_radius=options.robot_radius, allow_outside=options.allow_outside
         )
-        print("\n" * (index > 0) + describe(occupancy_map, options.robot_radius))
+        if index > 0:
+            say("")
+        say_lines(describe(occupancy_map, options.robot_radius).split("\n"))
     return 0

@@ -15,6 +15,7 @@ from sqn_jax.cli.arguments import (
     number,
     single_maps,
 )
+from sqn_jax.outside.messages import say
 
 
 def report(arguments: list[str]) -> int:
@@ -70,7 +71,7 @@ def report(arguments: list[str]) -> int:
         goal_radii=(config.env.goal_radius,),
     )
     reports.write_report(runs, settings, options.out, baselines=not options.no_references)
-    print(f"wrote {options.out}")
+    say(f"wrote {options.out}")
     return 0
 
 

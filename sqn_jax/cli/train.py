@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import difflib
 import re
-import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -199,11 +198,12 @@ def _run_training(config: TrainConfig, run_dir: Path, options: argparse.Namespac
 def _train(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> None:
     from sqn_jax.runs.train import train_session
     from sqn_jax.storage.manifest import Mismatch
+    from sqn_jax.storage.run_folder import resume_command
 
-    command = f"sqn train --run-dir {shlex.quote(str(run_dir))} --resume"
+    same = ""
     for name in ("device", "num_devices"):  # With others the results would differ.
         value = getattr(options, name)
-        command += "" if value is None else f" --{name.replace('_', '-')} {value}"
+        same += "" if value is None else f" --{name.replace('_', '-')} {value}"
     try:
         train_session(
             config,
@@ -211,7 +211,7 @@ def _train(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> N
             resume=options.resume,
             num_devices=options.num_devices,
             tensorboard=options.tensorboard,
-            resume_command=f"`{command}`",
+            resume_command=f"`{resume_command(run_dir, same)}`",
         )
     except Mismatch as error:
         if options.map is None or any(not row[0].startswith("map.") for row in error.rows):

@@ -12,6 +12,10 @@ from typing import Any, Literal
 
 from sqn_jax.config.run import TrainConfig
 from sqn_jax.config.validation import require
+from sqn_jax.outside.reading import read_json
+
+MAX_BYTES = 2**20
+"""Size of a file of settings at most; they have two kilobytes."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -45,7 +49,7 @@ def from_dict(data: Any, cls: type[Any] = TrainConfig, prefix: str = "") -> Any:
     hints = typing.get_type_hints(cls)
     values = {}
     for name, value in data.items():
-        require(name in known, f"{prefix}{name}", value, f"one of the fields {sorted(known)}")
+        require(name in known, f"{prefix}{name[:80]}", value, f"one of the fields {sorted(known)}")
         if dataclasses.is_dataclass(hints[name]):
             value = from_dict(value, typing.cast(type, hints[name]), f"{prefix}{name}.")
         else:
@@ -76,12 +80,7 @@ def load(path: Path) -> TrainConfig:
     Raises:
         ValueError: the file is missing, is not JSON, or holds an unusable value.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from None
+    data = read_json(path, MAX_BYTES, "settings", follow=False)
     try:
         return typing.cast(TrainConfig, from_dict(data))
     except ValueError as error:

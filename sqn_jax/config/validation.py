@@ -51,12 +51,16 @@ LIMITS: dict[str, tuple[float, float]] = {
     "num_seeds": (1, 10_000),
 }
 """Least and most of settings by their dotted names, where their own checks do not say both."""
+MAX_SHOWN = 200
+"""Letters of a value that an error shows."""
 
 
 def require(condition: bool, name: str, value: object, expected: str) -> None:
     """Raise ValueError, in one line, where a condition does not hold."""
     if not condition:
-        raise ValueError(f"{name} is {value!r}, expected {expected}")
+        text = repr(value)
+        shown_value = text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+        raise ValueError(f"{name} is {shown_value}, expected {expected}")
 
 
 def require_known_choices(config: object, group: str) -> None:

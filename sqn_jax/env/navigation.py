@@ -22,6 +22,13 @@ import numpy as np
 from jax import Array
 
 from sqn_jax.env import coverage, reward
+from sqn_jax.env.arguments import (
+    require_action,
+    require_key,
+    require_params,
+    require_place,
+    require_state,
+)
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.geometry import beam_angles, goal_in_robot_frame
 from sqn_jax.env.params import EnvParams, EnvState, Observation
@@ -65,6 +72,8 @@ def _place_near(key: Array, point: Array, params: EnvParams) -> Array:
 
 def reset(key: Array, params: EnvParams) -> tuple[Observation, EnvState]:
     """Start an episode at a random task; the key is consumed."""
+    require_key(key)
+    require_params(params)
     task_key, noise_key = jax.random.split(key)
     pose, goal = sample_task(task_key, params)
     return reset_to(noise_key, pose, goal, params)
@@ -74,6 +83,9 @@ def reset_to(
     key: Array, pose: Array, goal: Array, params: EnvParams
 ) -> tuple[Observation, EnvState]:
     """Start an episode at a given pose [3] and goal [2]; what the first scan sees is no reward."""
+    require_key(key)
+    require_params(params)
+    pose, goal = require_place("pose", pose, 3, params), require_place("goal", goal, 2, params)
     ranges = true_ranges(pose, params)
     covered, _ = _add_scan(coverage.empty(params.lattice), pose, ranges, params)
     state = EnvState(pose=pose, goal=goal, covered=covered, step=jnp.int32(0))
@@ -88,7 +100,8 @@ def step(
     Args:
         key: consumed; only used for noise.
         state: where the robot is.
-        action: integer in 0..4.
+        action: integer in 0..4. Where it is traced (under `jit`, `vmap`, `scan`) it cannot be
+            refused: what is above 4 acts as 4, what is negative counts from the end, -1 as 4.
         params: from `make_env`.
 
     Returns:
@@ -96,7 +109,15 @@ def step(
         (goal within `goal_radius`), `collision` (a refused move), `goal_distance` m,
         `covered_area` m2 newly seen, and the unweighted reward terms `reward_navigation`,
         `reward_exploration`, `reward_time`.
+
+    Raises:
+        ValueError: the action is known and none of 0..4, or an argument is of another kind or
+            shape than that of one robot.
     """
+    require_key(key)
+    require_params(params)
+    require_state(state)
+    require_action(action, NUM_ACTIONS)
     motion_key, reading_key = jax.random.split(key)
     velocity = params.commands[action]
     if params.config.velocity_noise > 0:

@@ -20,6 +20,7 @@ from sqn_jax.evaluation.statistics import (
     stratified_bootstrap,
     wilson_interval,
 )
+from sqn_jax.outside.messages import shown
 
 
 def describe(
@@ -191,9 +192,9 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
         if (spread := entry["success"]["std_of_means"]) is not None:
             successes[0] += f" ± {spread:.2f}"
         tasks = "" if entry["tasks"] == "evaluation points" else f" ({entry['tasks']})"
-        cells = [entry["map"] + tasks, entry["agent"], _noise_of(entry), *successes]
-        shown = (("time_steps", 1), ("time_steps_success", 1), ("steps_over_oracle", 2), ("spl", 2))
-        for name, digits in shown:
+        cells = [shown(entry["map"]) + tasks, shown(entry["agent"]), _noise_of(entry), *successes]
+        columns = {"time_steps": 1, "time_steps_success": 1, "steps_over_oracle": 2, "spl": 2}
+        for name, digits in columns.items():
             metric = entry.get(name)
             cells.append("-" if metric is None else f"{metric['mean']:.{digits}f}")
         cells += [f"{entry['collisions']['mean']:.1f}", f"{entry['mean_reward']['mean']:.2f}"]

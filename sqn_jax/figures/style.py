@@ -10,7 +10,7 @@ from typing import BinaryIO
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sqn_jax.storage.files import written_whole
+from sqn_jax.storage.files import NotWritten, written_whole
 
 DPI = 160
 WIDTH_IN = 9.0
@@ -64,6 +64,9 @@ def save(figure: Figure, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"{path}: the name ends in {path.suffix!r}, expected .png")
-    with written_whole(path) as partial:
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NotWritten(path, error) from None
+    with written_whole(path) as partial:
         _write_png(figure, partial)

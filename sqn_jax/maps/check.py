@@ -16,6 +16,7 @@ from sqn_jax.maps.occupancy import (
     reachable_cells,
     traversable,
 )
+from sqn_jax.outside.messages import shown
 
 _SHOWN_POINTS = 12
 
@@ -51,7 +52,7 @@ def describe(
     used = reachable_cells(occupancy_map, robot_radius)
     x, y, yaw = occupancy_map.origin
     lines = [
-        f"map            {occupancy_map.name}",
+        f"map            {shown(occupancy_map.name)}",
         f"size           {width:.2f} x {height:.2f} m, "
         f"{cols} x {rows} cells of {occupancy_map.resolution:g} m",
         f"origin         ({x:g} m, {y:g} m), yaw {math.degrees(yaw):.1f} degrees",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from sqn_jax.maps.files import one_line
+from sqn_jax.outside.messages import one_line
 
 MAX_PIXELS = 64 * 2**20
 MAX_IMAGE_BYTES = 512 * 2**20

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.files import named, read_at_most
 from sqn_jax.maps.image import MAX_PIXELS
 from sqn_jax.maps.occupancy import (
     EVALUATION_COUNT,
@@ -16,6 +15,8 @@ from sqn_jax.maps.occupancy import (
     close_border,
     sample_spawn_points,
 )
+from sqn_jax.outside.messages import named
+from sqn_jax.outside.reading import read_at_most
 
 _FREE = b".GS"  # ground, and swamp, which can be crossed
 _BLOCKED = b"@OTW"  # out of bounds, trees, water

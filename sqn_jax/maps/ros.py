@@ -21,7 +21,6 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from sqn_jax.maps.files import named, one_line, read_at_most
 from sqn_jax.maps.image import (
     MODES,
     GrayImage,
@@ -38,6 +37,8 @@ from sqn_jax.maps.occupancy import (
     sample_spawn_points,
     validate,
 )
+from sqn_jax.outside.messages import named, one_line
+from sqn_jax.outside.reading import read_at_most
 
 DEFAULT_ROBOT_RADIUS = 0.1
 MAX_YAML_BYTES = 2**20

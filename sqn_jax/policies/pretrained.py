@@ -7,25 +7,33 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
+import math
+import zipfile
 from collections.abc import Mapping
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
-from sqn_jax.policies.run_policies import Policy, load_policy
-from sqn_jax.storage.files import write_json
+from sqn_jax.outside.messages import one_line
+from sqn_jax.outside.reading import read_at_most, read_json
+from sqn_jax.policies.run_policies import Policy, load_policy, require_finite
+from sqn_jax.storage.files import write_json, write_whole
 from sqn_jax.training.state import params_shapes
 
 PREFIX = "pretrained:"
 SUFFIX = ".npz"
+
+MAX_JSON_BYTES = 2**20
+"""Size of the settings and the model card at most; they have some kilobytes."""
+
+MAX_HEADER_BYTES = 2**12
+"""Size of what stands before the numbers of an array, at most."""
 
 
 def find_policy(name: str, checkpoint: int | str = "newest") -> Policy:
@@ -71,23 +79,48 @@ def load_pretrained(name: str) -> Policy:
     return read_policy(_folder(), name)
 
 
-def read_policy(folder: Traversable, name: str) -> Policy:
+def read_policy(folder: Path, name: str) -> Policy:
     """The policy in NAME.npz and NAME.json of a folder.
+
+    The sizes that the file states are compared with those of the network in its settings before
+    anything is unpacked.
 
     Raises:
         ValueError: a file is missing or damaged, or the arrays are not those of the network.
     """
     try:
-        description = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        config = configs.from_dict(description["config"])
-        packed = (folder / f"{name}.npz").read_bytes()
+        description = read_json(folder / f"{name}.json", MAX_JSON_BYTES, "a policy's settings")
+        if not isinstance(description, dict) or not {"config", "sha256"} <= description.keys():
+            raise ValueError(f"{name}.json lacks config or sha256, expected both")
+        config: TrainConfig = configs.from_dict(description["config"])
+        if config.num_seeds != 1:
+            raise ValueError(f"num_seeds is {config.num_seeds}, expected 1 in a policy's file")
+        expected = traverse_util.flatten_dict(params_shapes(config), sep="/")
+        sizes = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in expected.values())
+        limit = sizes + 2 * MAX_HEADER_BYTES * (len(expected) + 1)
+        packed = read_at_most(folder / f"{name}.npz", limit, "the arrays of its network")
         if hashlib.sha256(packed).hexdigest() != description["sha256"]:
             raise ValueError(f"{name}.npz is not the file that {name}.json belongs to")
-        with np.load(io.BytesIO(packed), allow_pickle=False) as file:
-            arrays = {path: file[path] for path in file.files}
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"policy {name}: cannot be read ({error})") from None
-    return Policy(name, config, (_tree(arrays, config, name),))
+        headers = _headers(packed)
+    except ValueError as error:
+        raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
+    for path in sorted(expected.keys() | headers.keys()):
+        wanted = expected[path].shape if path in expected else None
+        shape = headers[path][0] if path in headers else None
+        if wanted != shape:
+            raise ValueError(f"policy {name}: array {path} is {shape}, expected {wanted}")
+        if headers[path][1] != expected[path].dtype:
+            raise ValueError(
+                f"policy {name}: array {path} is of type {headers[path][1]}, expected "
+                f"{expected[path].dtype}"
+            )
+    try:
+        arrays = _arrays(packed, headers)
+    except ValueError as error:
+        raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
+    params = traverse_util.unflatten_dict(arrays, sep="/")
+    require_finite(params, f"policy {name}")
+    return Policy(name, config, (jax.tree.map(jnp.asarray, params),))
 
 
 def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index: int = 0) -> None:
@@ -106,21 +139,60 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
     arrays = {path: np.asarray(array) for path, array in flat.items()}
     np.savez_compressed(file, allow_pickle=False, **arrays)
     packed = file.getvalue()
-    (folder / f"{policy.name}.npz").write_bytes(packed)
+    write_whole(folder / f"{policy.name}.npz", packed)
     digest = hashlib.sha256(packed).hexdigest()
     write_json(folder / f"{policy.name}.json", {"card": card, "config": config, "sha256": digest})
 
 
-def _folder() -> Traversable:
-    return resources.files("sqn_jax.policies") / "weights"
+def _folder() -> Path:
+    return Path(__file__).parent / "weights"
 
 
-def _tree(arrays: Mapping[str, Any], config: TrainConfig, name: str) -> Any:
-    expected = traverse_util.flatten_dict(params_shapes(config), sep="/")
-    for path in sorted(expected.keys() | arrays.keys()):
-        wanted = expected[path].shape if path in expected else None
-        shape = arrays[path].shape if path in arrays else None
-        if wanted != shape:
-            raise ValueError(f"policy {name}: array {path} is {shape}, expected {wanted}")
-    loaded = {path: jnp.asarray(array, expected[path].dtype) for path, array in arrays.items()}
-    return traverse_util.unflatten_dict(loaded, sep="/")
+def _headers(packed: bytes) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
+    """Shape, dtype and place of the numbers of each array in a .npz file; no number is unpacked.
+
+    Raises:
+        ValueError: it is no such file, holds something else, or an array twice.
+    """
+    headers: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as file:
+            for entry in file.infolist():
+                path = entry.filename.removesuffix(".npy")
+                if path in headers or path == entry.filename:
+                    raise ValueError(f"it holds {entry.filename!r}, expected arrays, each once")
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{path!r} is compressed in another way than NumPy does")
+                with file.open(entry) as member:
+                    start = io.BytesIO(member.read(MAX_HEADER_BYTES))
+                if np.lib.format.read_magic(start) != (1, 0):
+                    raise ValueError(f"{path!r} is in another version of the format than 1.0")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(start)
+                num_bytes = start.tell() + math.prod(shape) * dtype.itemsize
+                if dtype.hasobject or entry.file_size != num_bytes:
+                    raise ValueError(f"{path!r} is no array of numbers of the size that it states")
+                headers[path] = (shape, dtype, num_bytes)
+    except Exception as error:  # zipfile and NumPy raise a dozen kinds on damaged files.
+        raise ValueError(f"no sound .npz file: {error}") from None
+    return headers
+
+
+def _arrays(
+    packed: bytes, headers: Mapping[str, tuple[tuple[int, ...], np.dtype[Any], int]]
+) -> dict[str, Any]:
+    """The arrays, whose headers are those of the network.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as file:
+            for path, (_, _, num_bytes) in headers.items():
+                with file.open(f"{path}.npy") as member:
+                    data = member.read(num_bytes)
+                    member.read(1)  # At the end the checksum is compared.
+                arrays[path] = np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:  # As above.
+        raise ValueError(f"no sound .npz file: {error}") from None
+    return arrays

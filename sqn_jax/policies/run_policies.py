@@ -8,12 +8,13 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sqn_jax import config as configs
 from sqn_jax.agent.networks import Params
 from sqn_jax.config import TrainConfig
 from sqn_jax.storage.checkpoint import Checkpoints
-from sqn_jax.storage.manifest import Origin
+from sqn_jax.storage.manifest import Origin, leaves_of
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
 from sqn_jax.training.state import RunnerState, params_shapes
 
@@ -55,7 +56,23 @@ def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
         params = checkpoints.restore_policy(
             params_shapes(config), averaged=config.averages_params, which=checkpoint
         )
+    require_finite(params, f"run folder {run_dir}")
     return Policy(run_dir.resolve().name, config, seeds_of(params, config))
+
+
+def require_finite(params: Params, source: str) -> None:
+    """Refuse parameters that are not finite: a robot would take any action as the best.
+
+    Args:
+        params: the tree.
+        source: what the error calls it.
+
+    Raises:
+        ValueError: one line naming an array.
+    """
+    for path, leaf in leaves_of(params):
+        if not np.isfinite(leaf).all():
+            raise ValueError(f"{source}: array {path} holds numbers that are not finite")
 
 
 def seeds_of(params: Params, config: TrainConfig) -> tuple[Params, ...]:

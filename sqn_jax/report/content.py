@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from sqn_jax.evaluation.agents import (
 )
 from sqn_jax.evaluation.compare import evaluate_agents, load_maps, memory_bytes, num_episodes
 from sqn_jax.evaluation.settings import Settings
+from sqn_jax.outside.messages import say
 from sqn_jax.policies.pretrained import find_policy, names_a_run
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.episodes import WorstEpisode, worst_episodes
@@ -83,21 +83,7 @@ def _read_run(name: str, checkpoint: int | str) -> Run:
     if not names_a_run(name):
         return Run(name, policy, [], {})
     folder, _ = RunFolder.open(Path(name))
-    return Run(policy.name, policy, folder.read_metrics(), _summary(folder.path))
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    """The summary of a run; a run that was stopped has none."""
-    path = folder / "summary.json"
-    if not path.is_file():
-        return {}
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from None
-    if not isinstance(summary, dict):
-        raise ValueError(f"{path}: holds {type(summary).__name__}, expected an object")
-    return summary
+    return Run(policy.name, policy, folder.read_metrics(), folder.read_summary())
 
 
 def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) -> Content:
@@ -123,7 +109,7 @@ def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) 
 
     with episodes_bar(num_episodes(agents, settings)) as bar:
         evaluation, _ = evaluate_agents(agents, maps, settings, bar.update, collect, fields)
-    print("drawing the worst episodes ...", flush=True)
+    say("drawing the worst episodes ...", flush=True)
     return Content(list(runs), trained, settings, evaluation, batches, worst_episodes(batches))
 
 

@@ -18,7 +18,7 @@ from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import NEAR, WorstEpisode
 from sqn_jax.report.pictures import Illustration, Illustrations
-from sqn_jax.storage.files import probe_writable, written_whole
+from sqn_jax.storage.files import NotWritten, probe_file, written_whole
 from sqn_jax.storage.run_folder import CONFIG
 
 _BASELINE_NAMES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
@@ -70,9 +70,9 @@ def require_writable(path: Path) -> None:
     if not path.parent.is_dir() or path.is_dir():
         raise ValueError(f"--out {path}: expected a file in an existing folder")
     try:
-        probe_writable(path.parent)
-    except OSError as error:
-        raise ValueError(f"--out {path}: cannot be written ({error.strerror})") from None
+        probe_file(path)
+    except NotWritten as error:
+        raise ValueError(f"--out {error}") from None
 
 
 def write_page(path: Path, html: str) -> None:

@@ -23,6 +23,7 @@ from sqn_jax.evaluation.recording import Episode, record_episodes
 from sqn_jax.evaluation.settings import Settings, Tasks, World, robot_for, task_key, worlds
 from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
+from sqn_jax.outside.messages import say
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import probe_writable, written_whole
@@ -93,12 +94,12 @@ def render_session(
     for name, agent in agents.items():
         robot = robot_for(agent.env_config, settings)
         if robot not in world_of:
-            print(f"preparing {map_name} for the robot ...", flush=True)
+            say(f"preparing {map_name} for the robot ...", flush=True)
             (world_of[robot],) = worlds(robot, maps, settings)
-        print(f"{name}: running ...", end="", flush=True)
+        say(f"{name}: running ...", end="", flush=True)
         first_seed = agent.training_seeds[0]
         recorded[name] = record_episodes(keys, agent, first_seed, world_of[robot])
-        print(f"\r{name}: {_outcome(recorded[name])}")
+        say(f"{name}: {_outcome(recorded[name])}", start="\r")
     return _draw(recorded, out, tasks=tasks, animations=animations, mp4=mp4)
 
 
@@ -178,7 +179,7 @@ def _draw(
     ):
         draw(path)
     for path in jobs:
-        print(f"wrote {path} ({_size(path.stat().st_size)})")
+        say(f"wrote {path} ({_size(path.stat().st_size)})")
     return list(jobs)
 
 

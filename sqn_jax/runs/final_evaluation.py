@@ -14,6 +14,7 @@ from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.compare import evaluate_agents
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import OccupancyMap
+from sqn_jax.outside.messages import say
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices, memory_budget
@@ -90,7 +91,7 @@ def draw_figures(
     try:
         from sqn_jax import figures
     except ImportError:
-        print("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
+        say("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
         return False
     name = f"{config.algo.upper()} on {occupancy_map.name}"
     if (count := len(config.maps.names)) > 1:
@@ -145,17 +146,17 @@ def conclude(
     }
     # Before anything is printed: the reader of a pipe may have left.
     folder.write_json("summary.json", summary)
-    print(
+    say(
         f"trained in {_duration(summary['wall_seconds'])} "
         f"({summary['steps_per_second']:,} steps a second on average)"
     )
     for entry in results:
         low, high = entry["success"]["ci95"]
-        print(
+        say(
             f"{entry['tasks'] + ':':19} success {entry['success']['mean']:.2f} "
             f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
             f"({config.eval.episodes} greedy episodes"
             + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
         )
     if has_figures:
-        print(f"figures in {folder.figures}")
+        say(f"figures in {folder.figures}")

@@ -7,6 +7,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from sqn_jax.outside.messages import say
+
 
 def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
     """A progress bar over episodes; updated less often where stderr is not a terminal."""
@@ -24,4 +26,4 @@ def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
 
 def phase(name: str) -> None:
     """Say what a command does now, where it has no bar for it."""
-    print(f"{name} ...", file=sys.stderr, flush=True)
+    say(f"{name} ...", error=True, flush=True)

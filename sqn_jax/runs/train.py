@@ -9,7 +9,6 @@ import dataclasses
 import os
 import signal
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +21,8 @@ from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
+from sqn_jax.outside.messages import say
+from sqn_jax.outside.reading import read_at_most
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation, streams
@@ -33,7 +34,7 @@ from sqn_jax.storage.checkpoint import Checkpoints, chunks_in
 from sqn_jax.storage.compile_cache import cached_programs, watched_compilation
 from sqn_jax.storage.lock import locked
 from sqn_jax.storage.manifest import Manifest, Origin
-from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder
+from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder, require_usable
 from sqn_jax.training import devices, memory_budget
 from sqn_jax.training.loop import (
     ChunkReport,
@@ -46,6 +47,9 @@ from sqn_jax.training.loop import (
     start_run,
 )
 from sqn_jax.training.state import RunnerState, memory_bytes
+
+MAX_PICTURE_BYTES = 2**25
+"""Size of a figure for TensorBoard, at most."""
 
 
 @cached_programs()
@@ -77,6 +81,7 @@ def train_session(
         Diverged: the run has diverged.
         Interrupted: a signal stopped the run; the current chunk was finished and saved.
     """
+    require_usable(run_dir)
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
@@ -121,7 +126,8 @@ def _first_map(config: TrainConfig, occupancy_map: OccupancyMap) -> OccupancyMap
 def _add_figures(board: Board, config: TrainConfig, folder: RunFolder) -> None:
     # Not the hidden files, which a killed process has left behind.
     for path in sorted(folder.figures.glob("[!.]*.png")):
-        board.picture(path.stem, path.read_bytes(), config.num_rounds * config.num_envs)
+        png = read_at_most(path, MAX_PICTURE_BYTES, "a figure", follow=False)
+        board.picture(path.stem, png, config.num_rounds * config.num_envs)
 
 
 def _starting_policy(config: TrainConfig) -> Policy | None:
@@ -139,17 +145,20 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: s
     if config.num_seeds > 1:
         seeds = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
     episodes = config.num_rounds * config.num_envs
-    start = f"starting from {config.start_from}\n" if config.start_from else ""
-    print(
+    say(
         f"{config.algo.upper()} by {config.method.upper()} on {config.map}, {seeds}: "
-        f"{episodes:,} episodes of {program.max_steps} steps, {config.num_envs} robots at once\n"
-        f"{start}run folder {run_dir}, device {devices.describe(program.mesh)}, "
+        f"{episodes:,} episodes of {program.max_steps} steps, {config.num_envs} robots at once"
+    )
+    if config.start_from:
+        say(f"starting from {config.start_from}")
+    say(
+        f"run folder {run_dir}, device {devices.describe(program.mesh)}, "
         f"episodes in memory {num_bytes / 1e6:,.1f} MB"
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
-        print("checkpoints without the replay: a stopped run does not resume exactly")
+        say("checkpoints without the replay: a stopped run does not resume exactly")
     if resume_command:  # Later a signal may end the process at once.
-        print(f"if it is stopped, resume with {resume_command}", flush=True)
+        say(f"if it is stopped, resume with {resume_command}", flush=True)
 
 
 def _restored(
@@ -161,6 +170,7 @@ def _restored(
     """
     config = program.config
     runner, chunks = None, 0
+    folder.sweep()
     if checkpoints.chunks():
         runner, saved = checkpoints.restore(runner_shapes(env_params, program))
         chunks = rounds_done(runner) // config.rounds_per_chunk
@@ -170,25 +180,21 @@ def _restored(
                 f"total_episodes is {config.total_episodes}, expected at least the {episodes} that "
                 f"the run in {folder.path} has done"
             )
-        print(f"resuming after {chunks} of {config.num_chunks} chunks")
+        say(f"resuming after {chunks} of {config.num_chunks} chunks")
         _report_changes(saved, 1 if program.mesh is None else program.mesh.size)
         if config.method == "r2d2" and runner.learner.memory is None:
-            print("saved without the replay: resuming with an empty one, not exactly as before")
+            say("saved without the replay: resuming with an empty one, not exactly as before")
             memory = start_run(env_params, program).learner.memory
             learner = dataclasses.replace(runner.learner, memory=memory)
             runner = dataclasses.replace(runner, learner=learner)
     else:
         _require_none_lost(folder, config)
-        print("stopped before its first checkpoint: starting from the beginning")
+        say("stopped before its first checkpoint: starting from the beginning")
+    rows = folder.rows_of(chunks, config)
     folder.write_config(config)
-    folder.keep_metrics(chunks)
+    folder.write_metrics(rows)
     if chunks < config.num_chunks:
         folder.unfinish()
-    rows = folder.read_metrics()
-    if [row["chunk"] for row in rows] != list(range(1, chunks + 1)):
-        warnings.warn(
-            f"{folder.path}: metrics.jsonl has {len(rows)} rows of {chunks} chunks", stacklevel=2
-        )
     return runner
 
 
@@ -217,7 +223,7 @@ def _report_changes(saved: Manifest, num_devices: int) -> None:
     if changed:
         saved_under = ", ".join(f"{name} {old[name]}" for name in changed)
         resumed_under = ", ".join(f"{name} {new[name]}" for name in changed)
-        print(
+        say(
             f"saved under {saved_under}; resuming under {resumed_under}: "
             "the results will not be the same bit for bit"
         )
@@ -287,12 +293,12 @@ class _Training:
 
     def _compile(self) -> CompiledChunk:
         """Compile a chunk; refuse what does not fit into memory."""
-        print("compiling ...", end="", flush=True)
+        say("compiling ...", end="", flush=True)
         with watched_compilation() as was_read:
             compiled, seconds = compile_chunk(self._env_params, self._program)
         self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
         how = "compiled earlier, read" if was_read() else "compiled"
-        print(f"\r{how} in {seconds:.1f} s")
+        say(f"{how} in {seconds:.1f} s", start="\r")
         needed = memory_budget.compiled_bytes(compiled)
         memory_budget.require(needed, "training", self._config.method)
 

@@ -27,7 +27,7 @@ from jax.sharding import SingleDeviceSharding
 from sqn_jax.agent.learner import LearnerState
 from sqn_jax.agent.networks import Params
 from sqn_jax.storage import manifest
-from sqn_jax.storage.files import flush_to_disk
+from sqn_jax.storage.files import flush_folder
 from sqn_jax.storage.manifest import Damaged, Manifest, Mismatch, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS
 from sqn_jax.training.state import RunnerState
@@ -48,9 +48,9 @@ class NotSaved(OSError):
 
 def chunks_in(folder: Path) -> list[int]:
     """Chunks done at each checkpoint in a folder, the oldest first; none if there is no folder."""
-    if not folder.is_dir():
+    if folder.is_symlink() or not folder.is_dir():
         return []
-    names = [path.name for path in folder.iterdir() if path.is_dir()]
+    names = [path.name for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
     return sorted(int(name) for name in names if name.isascii() and name.isdigit())
 
 
@@ -100,7 +100,7 @@ class Checkpoints:
             manifest.write(partial, items, self._origin, chunk=chunk, score=score, exact=exact)
             self._set_aside(chunk)
             partial.rename(self._place(chunk))
-            _flush_folder(self._folder)
+            flush_folder(self._folder)
         except Exception as error:  # Orbax raises what its file library does.
             self._sweep()
             raise NotSaved(self._not_saved(chunk, error)) from None
@@ -275,16 +275,6 @@ def _reason(error: Exception) -> str:
         if os.strerror(number) in message:
             return os.strerror(number)
     return message[:200] or type(error).__name__
-
-
-def _flush_folder(folder: Path) -> None:
-    """Let a renaming survive a power cut."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            flush_to_disk(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _split(runner: RunnerState) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shutil
 import stat
 import sys
 import warnings
@@ -22,6 +23,8 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from tqdm import tqdm
 
+from sqn_jax.outside.messages import say, shown
+from sqn_jax.outside.reading import read_at_most
 from sqn_jax.storage.files import probe_writable
 
 VARIABLE = "SQN_JAX_CACHE"
@@ -107,9 +110,9 @@ def _open_folder(chosen: str) -> Path | None:
             return folder
     except OSError as error:
         fault = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    except RuntimeError as error:  # Nobody's home.
+    except (RuntimeError, ValueError) as error:  # Nobody's home, a circle of links, NUL.
         fault = str(error)
-    print(f"compiled programs are not kept: {fault}", file=sys.stderr)
+    say(f"compiled programs are not kept: {fault}", error=True)
     return None
 
 
@@ -136,18 +139,19 @@ def _tidy(folder: Path) -> None:
     """
     bytes_left, damaged = LARGEST_BYTES, 0
     entries = folder.glob(f"*{ENTRY}")
-    for entry in sorted(entries, key=lambda path: path.stat().st_mtime, reverse=True):
+    for entry in sorted(entries, key=lambda path: path.lstat().st_mtime, reverse=True):
         seal = _seal_of(entry)
-        is_sealed = seal.exists()  # Else a process was killed before it was finished.
-        is_sound = is_sealed and seal.read_bytes() == _digest(entry)
+        is_sealed = os.path.lexists(seal)  # Else a process was killed before it was finished.
+        is_sound = is_sealed and _is_sound(entry, seal)
         damaged += is_sealed and not is_sound
-        bytes_left -= entry.stat().st_size if is_sound else 0
+        bytes_left -= entry.lstat().st_size if is_sound else 0
         if not is_sound or bytes_left < 0:
-            entry.unlink(missing_ok=True)
-            seal.unlink(missing_ok=True)
+            for path in (entry, seal):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                path.unlink(missing_ok=True)
     if damaged:
-        message = f"compiled programs in {folder}: {damaged} damaged, to be compiled again"
-        print(message, file=sys.stderr)
+        say(f"compiled programs in {folder}: {damaged} damaged, to be compiled again", error=True)
 
 
 @contextmanager
@@ -156,7 +160,7 @@ def _sealed(folder: Path) -> Iterator[None]:
 
     def seal(event: str, *_: object, **__: object) -> None:
         for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 if not _seal_of(entry).exists():
                     _seal_of(entry).write_bytes(_digest(entry))
 
@@ -171,8 +175,18 @@ def _seal_of(entry: Path) -> Path:
     return entry.with_name(entry.name.removesuffix(ENTRY) + "-sha256")
 
 
+def _is_sound(entry: Path, seal: Path) -> bool:
+    """Whether an entry is what was written; links, pipes and folders are none."""
+    try:
+        expected = read_at_most(seal, 64, "a checksum", follow=False)
+        return expected == _digest(entry)
+    except (OSError, ValueError):
+        return False
+
+
 def _digest(path: Path) -> bytes:
-    return hashlib.sha256(path.read_bytes()).hexdigest().encode()
+    data = read_at_most(path, LARGEST_BYTES, "a compiled program", follow=False)
+    return hashlib.sha256(data).hexdigest().encode()
 
 
 @contextmanager
@@ -194,7 +208,8 @@ def _warnings_in_one_line(folder: Path) -> Iterator[None]:
             if verb not in troubles:
                 failure = f"{verb} {program} failed ({' '.join(reason.split())})"
                 # Through tqdm, since a progress bar may be on the screen.
-                tqdm.write(f"compiled programs in {folder}: {failure}; going on", file=sys.stderr)
+                message = shown(f"compiled programs in {folder}: {failure}; going on")
+                tqdm.write(message, file=sys.stderr)
             troubles.add(verb)
 
         warnings.showwarning = show

@@ -5,11 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from sqn_jax.outside.messages import say
+from sqn_jax.outside.reading import open_regular
 
 NAME = ".lock"
 
@@ -26,14 +28,17 @@ def locked(run_dir: Path) -> Iterator[None]:
     """
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        file = os.open(run_dir / NAME, os.O_RDWR | os.O_CREAT, 0o644)
+        file = open_regular(run_dir / NAME, os.O_RDWR | os.O_CREAT)
     except OSError as error:
-        raise ValueError(f"run folder {run_dir}: cannot be written ({error.strerror})") from None
+        where = f"{NAME} " if (run_dir / NAME).is_symlink() else ""
+        raise ValueError(
+            f"run folder {run_dir}: {where}cannot be written ({error.strerror})"
+        ) from None
     try:
         _take(file, run_dir)
         left = os.read(file, 200).decode(errors="replace").strip()
         if left:
-            print(f"{left}, did not end in order", file=sys.stderr)
+            say(f"{left}, did not end in order", error=True)
         _note(file, f"process {os.getpid()} on {platform.node()}, started {time.ctime()}")
         try:
             yield
@@ -52,10 +57,10 @@ def _take(file: int, run_dir: Path) -> None:
             f"run folder {run_dir}: in use by {owner}; stop that one first, or name another folder"
         ) from None
     except OSError as error:  # Some network file systems have none.
-        print(
+        say(
             f"run folder {run_dir}: cannot be locked ({error.strerror}); "
             "let no second process train in it",
-            file=sys.stderr,
+            error=True,
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +23,15 @@ import orbax.checkpoint
 import sqn_jax
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
+from sqn_jax.outside.reading import open_regular, parse_json
 from sqn_jax.storage.files import flush_to_disk
 from sqn_jax.training import devices
 
 NAME = "manifest.json"
 SCHEMA = 1
+
+MAX_BYTES = 2**26
+"""Size of a manifest at most; that of the preset `paper` has 20 kB."""
 
 CHANGEABLE = (
     *("total_episodes", "eval", "checkpoint_minutes", "checkpoint_replay"),
@@ -128,7 +133,8 @@ def write(
         },
     }
     entry = {"contents": contents, "sha256": _contents_digest(contents)}
-    with (folder / NAME).open("w", encoding="utf-8") as file:
+    descriptor = open_regular(folder / NAME, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
         json.dump(entry, file, indent=1)
         file.flush()
         flush_to_disk(file.fileno())
@@ -168,14 +174,17 @@ def read(folder: Path, chunk: int, items: Iterable[str] | None = None) -> Manife
 def _contents(folder: Path) -> dict[str, Any]:
     """The contents of a manifest that is whole."""
     try:
-        entry = json.loads((folder / NAME).read_text(encoding="utf-8"))
+        with os.fdopen(open_regular(folder / NAME), "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        entry = parse_json(data) if len(data) <= MAX_BYTES else None
     except FileNotFoundError:
         raise Damaged(f"{NAME} is missing") from None
     except OSError as error:
         raise Damaged(f"{NAME} cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError):
+    except ValueError:
         raise Damaged(f"{NAME} is not what was written") from None
-    contents = entry.get("contents") if isinstance(entry, dict) else None
+    entry = {"sha256": None, **entry} if isinstance(entry, dict) else {}
+    contents = entry.get("contents")
     if not isinstance(contents, dict) or entry.get("sha256") != _contents_digest(contents):
         raise Damaged(f"{NAME} is not what was written")
     if contents.get("schema") != SCHEMA:
@@ -190,17 +199,27 @@ def _contents(folder: Path) -> dict[str, Any]:
 
 def _is_well_formed(contents: Mapping[str, Any]) -> bool:
     """Whether everything that is read later on is there and of its kind."""
-    score, leaves = contents.get("score"), contents.get("leaves")
+    kinds: dict[str, Any] = {
+        **dict.fromkeys(("config", "files", "versions", "leaves"), dict),
+        **{"world": dict | None, "score": int | float | None, "exact": bool},
+        **{"chunk": int, "device": str, "num_devices": int},
+    }
     return (
-        all(isinstance(contents.get(name), dict) for name in ("config", "files", "versions"))
-        and isinstance(contents.get("world"), dict | None)
-        and (score is None or isinstance(score, int | float))
-        and {"chunk", "exact", "device", "num_devices"} <= contents.keys()
-        and isinstance(leaves, dict)
-        and all(
-            isinstance(leaf, dict) and {"shape", "dtype", "sha256"} <= leaf.keys()
-            for leaf in leaves.values()
-        )
+        all(isinstance(contents.get(name), kind) for name, kind in kinds.items())
+        and {"jax", "sqn_jax"} <= contents["versions"].keys()
+        and all(isinstance(word, str) for word in contents["versions"].values())
+        and all(map(_is_leaf, contents["leaves"].values()))
+    )
+
+
+def _is_leaf(leaf: object) -> bool:
+    """Whether the description of an array has what is read of it."""
+    return (
+        isinstance(leaf, dict)
+        and isinstance(leaf.get("dtype"), str)
+        and isinstance(leaf.get("sha256"), str)
+        and isinstance(shape := leaf.get("shape"), list)
+        and all(isinstance(size, int) for size in shape)
     )
 
 
@@ -295,7 +314,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _file_digest(path: Path, *, flush: bool = False) -> str:
-    with path.open("rb") as file:
+    with os.fdopen(open_regular(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         if flush:
             flush_to_disk(file.fileno())

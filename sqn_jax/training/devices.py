@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from sqn_jax.agent.shards import AXIS
 from sqn_jax.config import TrainConfig
+from sqn_jax.outside.messages import say
 
 REPLICATED = PartitionSpec()
 """Each device gets all of an array."""
@@ -66,10 +66,10 @@ def require(kind: str | None) -> None:
     if kind is not None and backend != kind:
         raise ValueError(f"--device is {kind}, expected one that JAX finds here: {backend}")
     if kind is None and backend == "cpu" and not os.environ.get("JAX_PLATFORMS") and _has_nvidia():
-        print(
+        say(
             "there is an NVIDIA GPU, but this JAX cannot use it: running on the CPU "
             "(pip install 'jax[cuda12]')",
-            file=sys.stderr,
+            error=True,
         )
 
 
@@ -88,7 +88,7 @@ def _use_own_modes() -> None:
     for name, expected in _MODES.items():
         if (value := getattr(jax.config, name)) != expected:
             jax.config.update(name, expected)
-            print(f"{name.upper()} is {value}, used is {expected}", file=sys.stderr)
+            say(f"{name.upper()} is {value}, used is {expected}", error=True)
 
 
 def _has_nvidia() -> bool:

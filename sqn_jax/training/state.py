@@ -22,6 +22,12 @@ from sqn_jax.env import NUM_ACTIONS, EnvParams, Observation
 from sqn_jax.training.devices import REPLICATED
 from sqn_jax.training.rollout import random_draws, start_actors, unroll
 
+MAX_SKILLS = 256
+"""Skills of a network: each is a module of its own in the program."""
+
+MAX_PARAMETERS = 2**27
+"""Parameters of all seeds of a run; those of the paper's network are 230,000."""
+
 
 @struct.dataclass
 class RunnerState:
@@ -61,11 +67,35 @@ def params_shapes(config: TrainConfig) -> Params:
     """Shapes of the parameters of a run, with a leading axis of seeds where there are several.
 
     They follow from the config alone: the map need not be at hand.
+
+    Raises:
+        ValueError: the network is larger than any that is trained here.
     """
+    _require_sensible(config)
     obs, carry = example_obs(config.env), initial_carry(config.network, 1)
     shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
     seeds = () if config.num_seeds == 1 else (config.num_seeds,)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)
+
+
+def _require_sensible(config: TrainConfig) -> None:
+    """Refuse, by arithmetic alone, a network whose description already would take gigabytes."""
+    network, beams = config.network, config.env.num_beams
+    if network.num_skills > MAX_SKILLS:
+        raise ValueError(
+            f"network.num_skills is {network.num_skills}, expected at most {MAX_SKILLS}"
+        )
+    size = network.hidden_size
+    width = size * (network.dqn_width_factor if config.algo == "dqn" else 1)
+    heads = network.num_skills + 1 if config.algo == "sqn" else 1
+    count = config.num_seeds * ((beams + 2 * size) * size + 2 * size * width + heads * width**2)
+    if count > MAX_PARAMETERS:
+        raise ValueError(
+            f"network.hidden_size {size}, network.num_skills {network.num_skills}, "
+            f"network.dqn_width_factor {network.dqn_width_factor}, env.num_beams {beams} and "
+            f"num_seeds {config.num_seeds} are {count:,} parameters or more, expected at most "
+            f"{MAX_PARAMETERS:,}"
+        )
 
 
 def trajectory_shapes(env_params: EnvParams, program: Program) -> Trajectory:

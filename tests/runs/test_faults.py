@@ -400,7 +400,8 @@ def test_a_run_whose_checkpoints_are_out_of_sight_does_not_start_again(
             (tmp_path / "run" / "checkpoints").unlink()
         code, _, err = tiny.call(str(tmp_path / "run"), "--total-episodes", "60", resume=True)
         assert code == 2
-        assert "holds no checkpoint that can be used" in err
+        fault = "checkpoints is a symbolic link" if odd else "holds no checkpoint that can be used"
+        assert fault in err
         assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == metrics
         assert (tmp_path / "run" / "summary.json").exists()
 
