@@ -15,10 +15,11 @@ from typing import Any
 
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
-from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.config.presets import PAPER_MAPS, PRESETS
 from sqn_jax.evaluation.recording import Episode, record
 from sqn_jax.maps import load_map
 from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.training.state import params_shapes
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "images"
@@ -31,6 +32,11 @@ def episodes(name: str, map_name: str, count: int) -> tuple[Episode, ...]:
     recorded_episodes = record(policy, map_name, episodes=count)
     agent = policy.config.algo.upper()
     return tuple(dataclasses.replace(episode, agent=agent) for episode in recorded_episodes)
+
+
+def network() -> Any:
+    """The network of the preset `paper`, from its parameter tree."""
+    return figures.network_architecture(params_shapes(PRESETS["paper"]), title="Skill Q-Network")
 
 
 def maps() -> Any:
@@ -95,7 +101,7 @@ def robustness() -> Any:
 STILLS: dict[str, Callable[[], Any]] = {
     function.__name__: function
     for function in (
-        *(maps, observations, coverage, reachability, timeline, skills, agents),
+        *(network, maps, observations, coverage, reachability, timeline, skills, agents),
         *(learning_curve, learning_curves, robustness),
     )
 }
