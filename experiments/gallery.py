@@ -75,20 +75,20 @@ def skills() -> Any:
 def agents() -> Any:
     """The same tasks for every agent."""
     by_agent = {name.upper(): episodes(name, "maze", 8)[:3] for name in ALGORITHMS}
-    return figures.agents_side_by_side(by_agent, title="The same tasks on the maze")
+    return figures.agents_side_by_side(by_agent, title="The same tasks in the maze")
 
 
 def learning_curve() -> Any:
     """How the default preset learns, from the record of a run."""
     rows = recorded("maze_quick.json")["runs"][0]["curve"]
-    return figures.learning_curve(rows, title="SQN on maze")
+    return figures.learning_curve(rows, title="SQN, maze")
 
 
 def learning_curves() -> Any:
     """How three agents learn, from the record of the table's runs."""
     runs = recorded("pretrained_runs.json")["runs"]
     curves = {run_record["config"]["algo"].upper(): [run_record["curve"]] for run_record in runs}
-    return figures.learning_curves(curves, title="Training on the maze")
+    return figures.learning_curves(curves, title="Training in the maze")
 
 
 def robustness() -> Any:

@@ -18,6 +18,8 @@ from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
 
+_TICK_GAP = 0.12  # of the axis between two labels of minutes
+
 
 def _metric(rows: Rows, name: str) -> Floats:
     """A metric as [R, S] (rows, seeds); NaN for None and for rows without it."""
@@ -94,7 +96,7 @@ def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats
     axes.set_title("success under exploration noise", fontsize=11)
     _draw_curve(axes, episodes, success, COLORS[2], "success")
     if np.isfinite(epsilon).any():
-        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
+        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "epsilon: random actions", "--")
     _finish_fractions(axes)
 
 
@@ -141,6 +143,12 @@ def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
     if ticks.size < 2:
         ticks = minutes[-1:]
     positions = np.interp(ticks, minutes, episodes[is_known])
+    # Compilation takes time without episodes: its minutes would lie on top of each other.
+    clear = [0]
+    for number in range(1, ticks.size):
+        if positions[number] - positions[clear[-1]] >= _TICK_GAP * max(1.0, episodes.max()):
+            clear.append(number)
+    ticks, positions = ticks[clear], positions[clear]
     top = axes.secondary_xaxis("top")
     top.set_xticks(positions, [f"{tick:.3g}" for tick in ticks], fontsize=9)
     top.tick_params(color="0.5", labelcolor="0.35")
@@ -176,7 +184,7 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
             _draw_band(axes, episodes, values, COLORS[number % len(COLORS)], plain(agent))
     for axes, name in zip(panels, ("mean reward a step", "success while training"), strict=True):
         axes.set_title(name, fontsize=11)
-        axes.set_xlabel("episodes")
+        axes.set_xlabel("training episodes")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         tidy(axes)
     panels[1].set_ylim(0, 1.02)

@@ -155,7 +155,7 @@ def _draw_module(axes: Axes, box: _Box, label: str, module: Tree, color: str) ->
     middle = box.left + box.width / 2
     y = box.top - _MARGIN - _LINE / 2
     options: dict[str, Any] = {"ha": "center", "va": "center"}
-    axes.text(middle, y, label, fontsize=10.5, fontweight="bold", color=INK, **options)
+    axes.text(middle, y, label, fontsize=10, fontweight="bold", color=INK, **options)
     rows = _rows(module)
     for number, row in enumerate(rows, start=1):
         color = _INK_LIGHT if number == len(rows) else INK

@@ -93,7 +93,7 @@ def agents_side_by_side(
             draw_skill_path(axes, episode)
             outcome = f"{episode.time_steps} steps" if episode.success else "not reached"
             axes.set_title(plain(f"{agent}: {outcome}"), fontsize=10)
-    scale_below(figure, image, grid, "distance to the goal, m")
+    scale_below(figure, image, grid, "path to the goal, m")
     _finish(figure, grid, [episode for task in tasks for episode in task], title)
     return figure
 

@@ -65,7 +65,7 @@ def draw_pictures(content: Content) -> Illustrations:
 
 
 def _title(batch: EpisodeBatch) -> str:
-    return f"{batch.agent.name} on {batch.world.occupancy_map.name}, {batch.world.tasks}"
+    return f"{batch.agent.name}, {batch.world.occupancy_map.name}, {batch.world.tasks}"
 
 
 def _trajectories(batch: EpisodeBatch, chosen: slice, title: str) -> Any:
