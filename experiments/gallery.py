@@ -21,6 +21,8 @@ from sqn_jax.maps import load_map
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.training.state import params_shapes
 
+FIGURE_AGENTS = ("SQN", "R2D2", "DQN", "best")
+
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "images"
 
@@ -78,6 +80,15 @@ def agents() -> Any:
     return figures.agents_side_by_side(by_agent, title="The same tasks in the maze")
 
 
+def trajectories() -> Any:
+    """Paths of the agents in the maze and in the cave, over the distance to the goal."""
+    rows = {}
+    for map_name, count in (("maze", 8), ("cave", 6)):
+        by_agent = {name: episodes(name.lower(), map_name, count)[0] for name in FIGURE_AGENTS}
+        rows[map_name] = by_agent
+    return figures.agents_on_maps(rows, title="The same task for each agent, in two maps")
+
+
 def learning_curve() -> Any:
     """How the default preset learns, from the record of a run."""
     rows = recorded("maze_quick.json")["runs"][0]["curve"]
@@ -101,7 +112,17 @@ def robustness() -> Any:
 STILLS: dict[str, Callable[[], Any]] = {
     function.__name__: function
     for function in (
-        *(network, maps, observations, coverage, reachability, timeline, skills, agents),
+        *(
+            network,
+            maps,
+            observations,
+            coverage,
+            reachability,
+            timeline,
+            skills,
+            agents,
+            trajectories,
+        ),
         *(learning_curve, learning_curves, robustness),
     )
 }

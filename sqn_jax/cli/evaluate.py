@@ -45,12 +45,12 @@ def evaluate(arguments: list[str]) -> int:
         help="steps per episode (default: each map's limit)",
     )
     add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
-    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add("--no-baselines", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")
     options = parser.parse_args(arguments)
-    if not options.runs and options.no_references:
+    if not options.runs and options.no_baselines:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax.evaluation.agents import group_policies, with_baselines
     from sqn_jax.evaluation.scores import results_table
@@ -76,7 +76,7 @@ def evaluate(arguments: list[str]) -> int:
     if options.out is not None:
         _require_writable(options.out)
     trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
-    agents = with_baselines(trained, baselines=not options.no_references)
+    agents = with_baselines(trained, baselines=not options.no_baselines)
     evaluation = evaluate_session(agents, settings, options.out)
     print(results_table(evaluation["results"]))
     for comparison in evaluation["comparisons"]:

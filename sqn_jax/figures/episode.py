@@ -195,7 +195,7 @@ def reachability_example(
         draw_robot(axes, episode, index, size=0.6)
         _show_around(axes, episode, index)
         status = "in sight" if moment.reachable else "hidden"
-        axes.set_title(f"goal {moment.distance:.1f} m away, {status}", fontsize=11)
+        axes.set_title(f"Goal {moment.distance:.1f} m away, {status}", fontsize=11)
         axes.set(xlabel="x, m", ylabel="y, m" if axes is panels[0] else "")
     markers = [handle for handle in _marker_handles() if handle.get_label() != "start"]
     figure.legend(

@@ -109,7 +109,7 @@ def _open_folder(chosen: str) -> Path | None:
         fault = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except RuntimeError as error:  # Nobody's home.
         fault = str(error)
-    print(f"compiled programs are not kept: {fault}", file=sys.stderr)
+    print(f"compiled programs are not cached: {fault}", file=sys.stderr)
     return None
 
 

@@ -102,7 +102,7 @@ def test_every_agent_meets_the_same_tasks_under_every_noise(
 def test_the_policy_is_the_one_the_training_ended_with(run_dir: Path, tmp_path: Path) -> None:
     """The same episodes as in the run's own evaluation, from the run folder alone."""
     words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", "4", "--eval-seeds", "1"]
-    words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-references"]
+    words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-baselines"]
     assert main([*words, "--out", str(tmp_path / "again.json")]) == 0
     again = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
     own = [json.loads(line) for line in (run_dir / "evaluation.jsonl").read_text().splitlines()]
@@ -157,7 +157,7 @@ def test_the_step_limit_is_the_map_s_whatever_the_run_was_trained_with(
     run_dir: Path, tmp_path: Path
 ) -> None:
     words = ["evaluate", str(run_dir), "--maps", "column", "--episodes", "1", "--eval-seeds", "1"]
-    assert main([*words, "--no-references", "--out", str(tmp_path / "found.json")]) == 0
+    assert main([*words, "--no-baselines", "--out", str(tmp_path / "found.json")]) == 0
     lines = (tmp_path / "found.jsonl").read_text().splitlines()
     failures = [record for record in map(json.loads, lines) if not record["success"]]
     assert {record["time_steps"] for record in failures} == {load_map("column").max_steps}
@@ -186,7 +186,7 @@ def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
 ) -> None:
     def refusal(words: list[str]) -> str:
         capsys.readouterr()
-        assert main(["evaluate", *words, "--no-references", "--episodes", "1"]) == 2
+        assert main(["evaluate", *words, "--no-baselines", "--episodes", "1"]) == 2
         told = capsys.readouterr().err
         assert told.startswith("sqn: ")
         assert told.count("\n") == 1, told
@@ -240,7 +240,7 @@ def test_a_run_without_a_checkpoint_is_named(
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (["--no-references"], ["run folder"]),
+        (["--no-baselines"], ["run folder"]),
         (["nowhere"], ["nowhere", "holds no run"]),
         (["--episodes", "0"], ["episodes", "0", "at least 1"]),
         (["--episodes", "1000000000000"], ["episodes", "1000000000000", "at most"]),

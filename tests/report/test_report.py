@@ -221,8 +221,8 @@ def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() ->
     assert "stuck: it spent 4 of the last 6 steps within 1 m of (8.0, 1.0) m" in told
     assert "shortest path to the goal was 7.0 m from the start and 3.0 m from the end" in told
     assert "from (2.0, 1.0) m to the goal at (9.0, 1.0) m" in told
-    assert "4 moves were refused" in told
-    assert "sqn, training seed 4, on hall (evaluation points, episode 0" in told
+    assert "There were 4 collisions." in told
+    assert "sqn, training seed 4, in hall (evaluation points, episode 0" in told
 
 
 def test_a_robot_that_was_nowhere_for_long_is_not_called_stuck() -> None:
@@ -241,7 +241,7 @@ def test_of_a_success_only_the_way_to_the_goal_counts() -> None:
     (hard,) = worst_episodes([batch_of(world, [path], [(8.05, 1.05)], [4])])
     assert (hard.place.steps, hard.place.of) == (3, 4)
     assert hard.place.x == pytest.approx(2.05)
-    assert hard.refused == 1  # The third move; the others came after the arrival.
+    assert hard.collisions == 1  # The third move; the others came after the arrival.
 
 
 def entry(agent: str, name: str, success: float, steps: float) -> dict[str, Any]:
@@ -328,7 +328,7 @@ def test_the_first_sentence_tells_success_and_steps_of_each_map() -> None:
         settings=Settings(maps=("maze", "hall")),
     )
     assert (
-        lead(content) == "sqn has success 0.75 on maze (123 steps) and 0.25 on hall (1,234 steps)."
+        lead(content) == "sqn has success 0.75 in maze (123 steps) and 0.25 in hall (1,234 steps)."
     )
 
 
