@@ -187,10 +187,10 @@ def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
     def refusal(words: list[str]) -> str:
         capsys.readouterr()
         assert main(["evaluate", *words, "--no-baselines", "--episodes", "1"]) == 2
-        told = capsys.readouterr().err
-        assert told.startswith("sqn: ")
-        assert told.count("\n") == 1, told
-        return told
+        stderr = capsys.readouterr().err
+        assert stderr.startswith("sqn: ")
+        assert stderr.count("\n") == 1, stderr
+        return stderr
 
     no_yaml = tmp_path / "bad.yaml"
     no_yaml.write_text("image: [")
@@ -220,9 +220,9 @@ def test_a_damaged_array_of_a_checkpoint_is_one_line(run_dir: Path, tmp_path: Pa
     program = [sys.executable, "-m", "sqn_jax", *words]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
-    told = [line for line in done.stderr.splitlines() if line.startswith("sqn: ")]
-    assert len(told) == 1
-    assert "damaged" in told[0]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("sqn: ")]
+    assert len(lines) == 1
+    assert "damaged" in lines[0]
 
 
 def test_a_run_without_a_checkpoint_is_named(
@@ -266,9 +266,9 @@ def test_wrong_words_of_evaluate_are_named_in_one_line(
     capsys: pytest.CaptureFixture[str], words: list[str], names: list[str]
 ) -> None:
     assert main(["evaluate", *words]) == 2
-    told = capsys.readouterr().err
-    lines = [line for line in told.splitlines() if line.startswith("sqn: ")]
+    stderr = capsys.readouterr().err
+    lines = [line for line in stderr.splitlines() if line.startswith("sqn: ")]
     assert len(lines) == 1
-    assert "Traceback" not in told
+    assert "Traceback" not in stderr
     for name in names:
-        assert name in lines[0], (name, told)
+        assert name in lines[0], (name, stderr)
