@@ -83,7 +83,8 @@ def evaluate(arguments: list[str]) -> int:
         low, high = comparison["ci95"]
         print(
             f"{comparison['first']} beats {comparison['second']} with probability "
-            f"{comparison['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
+            f"{comparison['probability']:.2f}, 95 % interval [{low:.2f}, {high:.2f}] "
+            "over training seeds"
         )
     if options.out is not None:
         print(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")

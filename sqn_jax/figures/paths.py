@@ -6,9 +6,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
@@ -17,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from sqn_jax.figures.ground import (
     RED,
     SKILL_LABEL,
-    SKILL_MAP,
     UNREACHABLE,
     YELLOW,
     draw_cross,
@@ -29,6 +29,11 @@ from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in a panel; more would hide each other
+
+
+# From skill 2, orange, over violet to skill 1, dark blue; steadily darker, so that it can be read
+# in grayscale. `ground.SKILL_MAP` is not: it ends in the colors of the skills.
+_WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
 class _Panel(NamedTuple):
@@ -198,7 +203,7 @@ def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bo
     if weights is None:
         lines.set_color(COLORS[0])
     else:
-        lines.set(array=weights, cmap=SKILL_MAP, norm=Normalize(0.0, 1.0))
+        lines.set(array=weights, cmap=_WEIGHT_MAP, norm=Normalize(0.0, 1.0))
     axes.add_collection(lines, autolim=False)
     axes.plot(*points[0], "o", ms=6, mfc="white", mec=INK, mew=1.3, zorder=5)
     if not reached:

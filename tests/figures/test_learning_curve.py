@@ -29,7 +29,7 @@ def test_the_curves_are_the_rows():
     figure = figures.learning_curve(rows, title="a run")
     expected = {
         "reward": [0.1, 0.3, 0.5, 0.7, 0.9],
-        "loss": [0.5, 0.25, 0.5 / 3, 0.125, 0.1],
+        "Loss": [0.5, 0.25, 0.5 / 3, 0.125, 0.1],
     }
     for title, values in expected.items():
         (line,) = panel(figure, title).lines
