@@ -15,10 +15,13 @@ from typing import Any
 
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
-from sqn_jax.config.presets import PAPER_MAPS
+from sqn_jax.config.presets import PAPER_MAPS, PRESETS
 from sqn_jax.evaluation.recording import Episode, record
 from sqn_jax.maps import load_map
 from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.training.state import params_shapes
+
+FIGURE_AGENTS = ("SQN", "R2D2", "DQN", "best")
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "images"
@@ -31,6 +34,11 @@ def episodes(name: str, map_name: str, count: int) -> tuple[Episode, ...]:
     recorded_episodes = record(policy, map_name, episodes=count)
     agent = policy.config.algo.upper()
     return tuple(dataclasses.replace(episode, agent=agent) for episode in recorded_episodes)
+
+
+def network() -> Any:
+    """The network of the preset `paper`, from its parameter tree."""
+    return figures.network_architecture(params_shapes(PRESETS["paper"]), title="Skill Q-Network")
 
 
 def maps() -> Any:
@@ -69,20 +77,29 @@ def skills() -> Any:
 def agents() -> Any:
     """The same tasks for every agent."""
     by_agent = {name.upper(): episodes(name, "maze", 8)[:3] for name in ALGORITHMS}
-    return figures.agents_side_by_side(by_agent, title="The same tasks on the maze")
+    return figures.agents_side_by_side(by_agent, title="The same tasks in the maze")
+
+
+def trajectories() -> Any:
+    """Paths of the agents in the maze and in the cave, over the distance to the goal."""
+    rows = {}
+    for map_name, count in (("maze", 8), ("cave", 6)):
+        by_agent = {name: episodes(name.lower(), map_name, count)[0] for name in FIGURE_AGENTS}
+        rows[map_name] = by_agent
+    return figures.agents_on_maps(rows, title="The same task for each agent, in two maps")
 
 
 def learning_curve() -> Any:
     """How the default preset learns, from the record of a run."""
     rows = recorded("maze_quick.json")["runs"][0]["curve"]
-    return figures.learning_curve(rows, title="SQN on maze")
+    return figures.learning_curve(rows, title="SQN, maze")
 
 
 def learning_curves() -> Any:
     """How three agents learn, from the record of the table's runs."""
     runs = recorded("pretrained_runs.json")["runs"]
     curves = {run_record["config"]["algo"].upper(): [run_record["curve"]] for run_record in runs}
-    return figures.learning_curves(curves, title="Training on the maze")
+    return figures.learning_curves(curves, title="Training in the maze")
 
 
 def robustness() -> Any:
@@ -95,7 +112,17 @@ def robustness() -> Any:
 STILLS: dict[str, Callable[[], Any]] = {
     function.__name__: function
     for function in (
-        *(maps, observations, coverage, reachability, timeline, skills, agents),
+        *(
+            network,
+            maps,
+            observations,
+            coverage,
+            reachability,
+            timeline,
+            skills,
+            agents,
+            trajectories,
+        ),
         *(learning_curve, learning_curves, robustness),
     )
 }

@@ -82,7 +82,7 @@ def dead_ends() -> str:
 
 
 def noise() -> str:
-    """Success on the maze under the paper's noise."""
+    """Success in the maze under the paper's noise."""
     three = _results("pretrained_noise.json")
     best = _results("best_noise.json")
     header = ["", "none", *(f"velocity {level:g}" for level in VELOCITY_NOISE)]

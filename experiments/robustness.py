@@ -53,9 +53,7 @@ def main() -> None:
     evaluation = evaluate_session(list(agents), settings, out / "robustness.json")
     radius = settings.goal_radii[0]
     shown = [entry for entry in evaluation["results"] if entry["goal_radius"] == radius]
-    figure = figures.robustness(
-        shown, title=f"Robustness on {options.map}, goal radius {radius:g} m"
-    )
+    figure = figures.robustness(shown, title=f"Robustness, {options.map}, goal radius {radius:g} m")
     figures.save(figure, out / "robustness.png")
     table = results_table(evaluation["results"])
     (out / "robustness.md").write_text(f"# Robustness\n\n{table}\n", encoding="utf-8")

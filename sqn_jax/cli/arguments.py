@@ -43,6 +43,15 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_no_baselines(parser: argparse.ArgumentParser) -> None:
+    """Add the option --no-baselines, and the name that it had."""
+    what = "leave out the oracle and the wall follower"
+    parser.add_argument("--no-baselines", action="store_true", help=what)
+    parser.add_argument(
+        "--no-references", action="store_true", dest="no_baselines", help=argparse.SUPPRESS
+    )
+
+
 def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     """Add the option --checkpoint."""
     parser.add_argument(

@@ -10,6 +10,7 @@ from sqn_jax.cli.arguments import (
     Parser,
     add_checkpoint,
     add_device,
+    add_no_baselines,
     integer,
     number,
     single_maps,
@@ -22,7 +23,7 @@ from sqn_jax.runs import streams
 def evaluate(arguments: list[str]) -> int:
     """Evaluate policies and baselines, and print a table."""
     options = _parser().parse_args(arguments)
-    if not options.runs and options.no_references:
+    if not options.runs and options.no_baselines:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax.evaluation.agents import group_policies, with_baselines
     from sqn_jax.evaluation.scores import results_table
@@ -50,14 +51,15 @@ def evaluate(arguments: list[str]) -> int:
     else:
         _require_writable(options.out)
     trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
-    agents = with_baselines(trained, baselines=not options.no_references)
+    agents = with_baselines(trained, baselines=not options.no_baselines)
     evaluation = evaluate_session(agents, settings, options.out)
     say_lines(results_table(evaluation["results"]).split("\n"))
     for comparison in evaluation["comparisons"]:
         low, high = comparison["ci95"]
         say(
             f"{comparison['first']} beats {comparison['second']} with probability "
-            f"{comparison['probability']:.2f} [{low:.2f}, {high:.2f}] over training seeds"
+            f"{comparison['probability']:.2f}, 95 % interval [{low:.2f}, {high:.2f}] "
+            "over training seeds"
         )
     if options.out is not None:
         say(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
@@ -100,7 +102,7 @@ def _parser() -> Parser:
         help="steps per episode (default: each map's limit)",
     )
     add("--goal-radius", nargs="+", type=number, default=[0.3, 0.5], metavar="M", help="m")
-    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add_no_baselines(parser)
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")

@@ -10,6 +10,7 @@ from sqn_jax.cli.arguments import (
     Parser,
     add_checkpoint,
     add_device,
+    add_no_baselines,
     folder,
     integer,
     number,
@@ -41,7 +42,7 @@ def report(arguments: list[str]) -> int:
     add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
     add("--eval-seeds", type=integer, default=1, help="number of evaluation seeds (default 1)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
-    add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
+    add_no_baselines(parser)
     add_checkpoint(parser)
     add_device(parser)
     add("--out", type=Path, default=Path("report.html"), help="default: report.html")
@@ -70,7 +71,7 @@ def report(arguments: list[str]) -> int:
         seed=options.seed,
         goal_radii=(config.env.goal_radius,),
     )
-    reports.write_report(runs, settings, options.out, baselines=not options.no_references)
+    reports.write_report(runs, settings, options.out, baselines=not options.no_baselines)
     say(f"wrote {options.out}")
     return 0
 

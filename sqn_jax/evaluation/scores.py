@@ -184,7 +184,7 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
     """
     radii = list(dict.fromkeys(entry["goal_radius"] for entry in results))
     header = ["map", "agent", "noise", *(f"success {radius:g} m" for radius in radii)]
-    header += ["steps", "steps (reached)", "over oracle", "SPL", "collisions", "reward"]
+    header += ["steps", "steps (reached)", "steps / oracle steps", "SPL", "collisions", "reward"]
     rows = []
     for entry in (entry for entry in results if entry["goal_radius"] == radii[0]):
         same_row = [other for other in results if _row_of(other) == _row_of(entry)]

@@ -8,9 +8,10 @@ from sqn_jax.figures.animation import frames, gif, mp4
 from sqn_jax.figures.curves import gate_entropy_curves, learning_curve, learning_curves
 from sqn_jax.figures.episode import coverage_example, reachability_example
 from sqn_jax.figures.gallery import map_gallery, observation_patterns
+from sqn_jax.figures.network import network_architecture
 from sqn_jax.figures.noise import robustness
 from sqn_jax.figures.paths import MAX_PATHS, trajectories
-from sqn_jax.figures.skills import agents_side_by_side, skill_trajectories
+from sqn_jax.figures.skills import agents_on_maps, agents_side_by_side, skill_trajectories
 from sqn_jax.figures.style import DPI, WIDTH_IN, Picture, picture, save
 from sqn_jax.figures.timeline import episode_timeline
 
@@ -19,6 +20,7 @@ __all__ = [
     "MAX_PATHS",
     "WIDTH_IN",
     "Picture",
+    "agents_on_maps",
     "agents_side_by_side",
     "coverage_example",
     "episode_timeline",
@@ -29,6 +31,7 @@ __all__ = [
     "learning_curves",
     "map_gallery",
     "mp4",
+    "network_architecture",
     "observation_patterns",
     "picture",
     "reachability_example",

@@ -18,6 +18,8 @@ from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
 
+_TICK_GAP = 0.12  # of the axis between two labels of minutes
+
 
 def _metric(rows: Rows, name: str) -> Floats:
     """A metric as [R, S] (rows, seeds); NaN for None and for rows without it."""
@@ -66,7 +68,7 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 6.4 if skills > 1 else 3.7), dpi=DPI, layout="constrained")
     lines, columns = (2, 2) if skills > 1 else (1, 3)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
-    panels[0].set_title("mean reward a step", fontsize=11)
+    panels[0].set_title("Mean reward per step", fontsize=11)
     _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLORS[0])
     _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
     _draw_loss(panels[2], episodes, _metric(rows, "loss"))
@@ -91,15 +93,15 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
 
 def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
     """Success, and the fraction of random actions (epsilon) under which it was measured."""
-    axes.set_title("success under exploration noise", fontsize=11)
+    axes.set_title("Success while exploring", fontsize=11)
     _draw_curve(axes, episodes, success, COLORS[2], "success")
     if np.isfinite(epsilon).any():
-        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "random actions", "--")
+        _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "epsilon (random actions)", "--")
     _finish_fractions(axes)
 
 
 def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
-    axes.set_title("loss", fontsize=11)
+    axes.set_title("Loss", fontsize=11)
     _draw_curve(axes, episodes, loss, COLORS[1])
     if not np.isfinite(loss).any():
         axes.text(0.5, 0.5, "no update yet", transform=axes.transAxes, ha="center", color="0.4")
@@ -110,7 +112,7 @@ def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
 
 def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -> None:
     """Mean weight of each skill [R, S, K], and the entropy [R, S] as a fraction of its maximum."""
-    axes.set_title("weight of the skills", fontsize=11)
+    axes.set_title("Skill weights", fontsize=11)
     skills = usage.shape[2]
     for skill in range(skills):
         color = COLORS[skill % len(COLORS)]
@@ -141,6 +143,12 @@ def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
     if ticks.size < 2:
         ticks = minutes[-1:]
     positions = np.interp(ticks, minutes, episodes[is_known])
+    # Compilation takes time without episodes: its minutes would lie on top of each other.
+    clear = [0]
+    for number in range(1, ticks.size):
+        if positions[number] - positions[clear[-1]] >= _TICK_GAP * max(1.0, episodes.max()):
+            clear.append(number)
+    ticks, positions = ticks[clear], positions[clear]
     top = axes.secondary_xaxis("top")
     top.set_xticks(positions, [f"{tick:.3g}" for tick in ticks], fontsize=9)
     top.tick_params(color="0.5", labelcolor="0.35")
@@ -174,9 +182,9 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
         for axes, name in zip(panels, ("mean_reward", "success"), strict=True):
             values = np.concatenate([_metric(rows[:length], name) for rows in rows_of_runs], axis=1)
             _draw_band(axes, episodes, values, COLORS[number % len(COLORS)], plain(agent))
-    for axes, name in zip(panels, ("mean reward a step", "success while training"), strict=True):
+    for axes, name in zip(panels, ("Mean reward per step", "Success while exploring"), strict=True):
         axes.set_title(name, fontsize=11)
-        axes.set_xlabel("episodes")
+        axes.set_xlabel("training episodes")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         tidy(axes)
     panels[1].set_ylim(0, 1.02)
@@ -222,9 +230,9 @@ def gate_entropy_curves(rows_by_run: Mapping[str, Rows], *, title: str) -> Figur
         if np.shape(rows[0]["skill_usage"])[-1] < 2:
             raise ValueError(f"run {run} has 1 skill, expected at least 2")
     has_distance = any("skill_distance" in row for rows in rows_by_run.values() for row in rows)
-    names = ["entropy of the skill decision / log K"]
+    names = ["Entropy / log K"]
     if has_distance:
-        names.append("distance between the skills' Q-values")
+        names.append("Distance between the skills' Q-values")
     figure = Figure(figsize=(WIDTH_IN, 3.7), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False)[0]
     for number, (run, rows) in enumerate(rows_by_run.items()):

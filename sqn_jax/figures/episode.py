@@ -164,7 +164,7 @@ class Moment(NamedTuple):
 
 
 def reachability_example(
-    episodes: Episode | Sequence[Episode], *, title: str = "Is the goal reachable? (eq. 8)"
+    episodes: Episode | Sequence[Episode], *, title: str = "Is the goal in sight? (eq. 8)"
 ) -> Figure:
     """Draw when the navigation reward is given: a goal that is near but hidden, and one in sight.
 
@@ -194,8 +194,8 @@ def reachability_example(
         draw_goal(axes, episode)
         draw_robot(axes, episode, index, size=0.6)
         _show_around(axes, episode, index)
-        status = "reachable" if moment.reachable else "hidden, not reachable"
-        axes.set_title(f"goal {moment.distance:.1f} m away, {status}", fontsize=11)
+        status = "in sight" if moment.reachable else "hidden"
+        axes.set_title(f"Goal {moment.distance:.1f} m away, {status}", fontsize=11)
         axes.set(xlabel="x, m", ylabel="y, m" if axes is panels[0] else "")
     markers = [handle for handle in _marker_handles() if handle.get_label() != "start"]
     figure.legend(

@@ -32,6 +32,7 @@ FIELD_MAP = ListedColormap(np.linspace([0.985, 0.99, 0.975], [0.70, 0.80, 0.82],
 # From the color of skill 2 over gray to that of skill 1; paths have a dark edge around the gray.
 SKILL_MAP = LinearSegmentedColormap.from_list("skills", [COLORS[1], "#dcdcdc", COLORS[0]], 255)
 ONE_SKILL = COLORS[3]
+SKILL_LABEL = "weight of skill 1"
 
 
 def extent(occupancy_map: OccupancyMap) -> dict[str, Any]:
@@ -169,7 +170,7 @@ def path_legend(episodes: Sequence[Episode]) -> list[Line2D | Patch]:
 def skill_bar(figure: Figure, axes: Sequence[Axes]) -> None:
     """Add the color scale of the paths of two skills below panels."""
     scale = ScalarMappable(Normalize(0.0, 1.0), SKILL_MAP)
-    bar = scale_below(figure, scale, axes, "weight of skill 1 against skill 2")
+    bar = scale_below(figure, scale, axes, SKILL_LABEL)
     bar.set_ticks(
         [0, 0.25, 0.5, 0.75, 1], labels=["0: skill 2", "0.25", "0.5", "0.75", "1: skill 1"]
     )

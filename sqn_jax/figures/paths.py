@@ -15,7 +15,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from numpy.typing import ArrayLike, NDArray
 
-from sqn_jax.figures.ground import RED, UNREACHABLE, YELLOW, draw_cross, draw_field
+from sqn_jax.figures.ground import (
+    RED,
+    SKILL_LABEL,
+    UNREACHABLE,
+    YELLOW,
+    draw_cross,
+    draw_field,
+)
 from sqn_jax.figures.style import COLORS, DPI, INK, OBSTACLE, WIDTH_IN, plain
 from sqn_jax.maps import OccupancyMap, goal_distance, traversable
 
@@ -23,8 +30,9 @@ Floats = NDArray[np.float64]
 
 MAX_PATHS = 8  # in a panel; more would hide each other
 
-# From skill 2, orange, over violet to skill 1, dark blue, as in all pictures; steadily darker, so
-# that it can be read in grayscale.
+
+# From skill 2, orange, over violet to skill 1, dark blue; steadily darker, so that it can be read
+# in grayscale. `ground.SKILL_MAP` is not: it ends in the colors of the skills.
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
@@ -96,10 +104,10 @@ def trajectories(
             colors = weights[:end, episode, 0] if skills > 1 else None
             _draw_path(axes, poses[: end + 1, episode], colors, reached=bool(success[episode]))
         _draw_goal(axes, panel, steps, goal_radius)
-    figure.colorbar(image, ax=grid, label="distance to the goal, m", aspect=35, pad=0.02)
+    figure.colorbar(image, ax=grid, label="path to the goal, m", aspect=35, pad=0.02)
     if skills > 1:
         lines = next(child for child in grid[0].collections if isinstance(child, LineCollection))
-        figure.colorbar(lines, ax=grid, label="weight of skill 1", aspect=35, pad=0.02)
+        figure.colorbar(lines, ax=grid, label=SKILL_LABEL, aspect=35, pad=0.02)
     _add_legend(figure, goal_radius, any_failure=any(panel.failed.size for panel in panels))
     shown = f"{success.sum()} of {count} reached"
     if len(panels) < len(all_panels):
@@ -221,6 +229,9 @@ def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> Non
         Line2D([], [], ls="", marker=marker, ms=size, mfc=face, mec=edge, mew=1.3, label=label)
         for label, marker, size, face, edge in markers
     ]
-    handles += [Patch(fc=OBSTACLE, label="obstacle"), Patch(fc=UNREACHABLE, label="unreachable")]
+    handles += [
+        Patch(fc=OBSTACLE, label="obstacle"),
+        Patch(fc=UNREACHABLE, label="no path to the goal"),
+    ]
     options: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
     figure.legend(handles=handles, loc="outside lower center", fontsize=9, **options)

@@ -341,7 +341,7 @@ class Screen:
         for omitted in range(len(episode.agent)):
             agent = episode.agent[: len(episode.agent) - omitted]
             ellipsis = "\N{HORIZONTAL ELLIPSIS}" if omitted else ""
-            name.set_text(f"{agent}{ellipsis} on {episode.occupancy_map.name}")
+            name.set_text(f"{agent}{ellipsis}, {episode.occupancy_map.name}")
             if name.get_window_extent(renderer).width <= width_left:
                 break
 

@@ -93,8 +93,44 @@ def agents_side_by_side(
             draw_skill_path(axes, episode)
             outcome = f"{episode.time_steps} steps" if episode.success else "not reached"
             axes.set_title(plain(f"{agent}: {outcome}"), fontsize=10)
-    scale_below(figure, image, grid, "distance to the goal, m")
+    scale_below(figure, image, grid, "path to the goal, m")
     _finish(figure, grid, [episode for task in tasks for episode in task], title)
+    return figure
+
+
+def agents_on_maps(episodes_by_map: Mapping[str, Mapping[str, Episode]], *, title: str) -> Figure:
+    """Draw one path of each agent on each map: a row for each map, a column for each agent.
+
+    This is the paper's figure of trajectories. The background is the length of the shortest path
+    to the goal, from 0 to the longest of the map. Paths have the colors of `skill_trajectories`.
+
+    Args:
+        episodes_by_map: for each map an episode of each agent, at most 5; the task of a map is the
+            same for all agents, and all maps have the same agents in the same order.
+        title: above all panels.
+
+    Raises:
+        ValueError: no maps, agents that differ between maps, or what `agents_side_by_side` refuses.
+    """
+    rows = list(episodes_by_map.values())
+    if not rows or any(list(row) != list(rows[0]) for row in rows):
+        raise ValueError(f"{len(rows)} maps, expected at least one, all with the same agents")
+    for row in rows:
+        _check_tasks({agent: [episode] for agent, episode in row.items()})
+    episodes = [episode for row in rows for episode in row.values()]
+    maps = [episode.occupancy_map for episode in episodes]
+    figure, grid = _map_grid(maps, len(rows[0]), tallest=3.6)
+    panels = iter(grid)
+    for map_name, row in episodes_by_map.items():
+        (field,) = _distance_fields([next(iter(row.values()))])
+        norm = Normalize(0.0, float(field[np.isfinite(field)].max()))
+        for agent, episode in row.items():
+            axes = next(panels)
+            draw_field(axes, episode.occupancy_map, field, norm)
+            draw_skill_path(axes, episode)
+            outcome = f"{episode.time_steps} steps" if episode.success else "not reached"
+            axes.set_title(plain(f"{agent}, {map_name}: {outcome}"), fontsize=9)
+    _finish(figure, grid, episodes, title)
     return figure
 
 

@@ -23,8 +23,9 @@ def episode_timeline(episode: Episode, *, title: str) -> Figure:
     The panels, from top to bottom: the skill weights, stacked (omitted for an agent without
     skills); the value of the best action of each skill and of their weighted sum; cumulative sums
     of the weighted terms of the reward; the straight-line distance to the goal, shaded while the
-    goal was reachable (paper, eq. 8), with a tick for each refused move. A dotted line in all
-    panels marks the arrival; the time axis extends beyond it by a quarter of the time before.
+    goal was reachable (paper, eq. 8), with a tick for each collision (a refused move). A dotted
+    line in all panels marks the arrival; the time axis extends beyond it by a quarter of the time
+    before.
 
     Args:
         episode: the episode.
@@ -95,7 +96,7 @@ def _draw_rewards(axes: Axes, episode: Episode) -> None:
 
 
 def _draw_distance(axes: Axes, episode: Episode) -> None:
-    """The distance [T + 1] m to the goal, when the goal was reachable, and the refused moves."""
+    """The distance [T + 1] m to the goal, when the goal was reachable, and the collisions."""
     times = np.arange(episode.num_steps + 1) * episode.time_step
     first = np.linalg.norm(episode.poses[0, :2] - episode.goal)
     distances = np.concatenate([[first], episode.goal_distances])
@@ -104,13 +105,13 @@ def _draw_distance(axes: Axes, episode: Episode) -> None:
         # A value measured after a step is shown until after the next step.
         shade = np.where(np.concatenate([[False], episode.reachable]), high, 0.0)
         options: dict[str, Any] = {"step": "post", "color": COLORS[2], "alpha": 0.25, "lw": 0}
-        axes.fill_between(times, 0, shade, label="goal reachable", **options)
+        axes.fill_between(times, 0, shade, label="goal in sight", **options)
     axes.plot(times, distances, color=COLORS[0], lw=1.8, label="distance")
     axes.axhline(episode.goal_radius, color="0.45", lw=0.9, ls="--", label="goal radius")
     if episode.collisions.any():
-        refused = times[1:][episode.collisions]
-        bottom = np.full(refused.shape, 0.03 * high)
-        axes.plot(refused, bottom, "|", color=COLORS[1], ms=9, mew=1.3, label="move refused")
+        collisions = times[1:][episode.collisions]
+        bottom = np.full(collisions.shape, 0.03 * high)
+        axes.plot(collisions, bottom, "|", color=COLORS[1], ms=9, mew=1.3, label="collision")
     if episode.success:
         axes.plot([], [], color=INK, ls=":", lw=1.4, label="goal radius entered")
     axes.set(ylim=(0, high), ylabel="to the goal, m")

@@ -31,8 +31,8 @@ def write_report(
         baselines: whether to evaluate the oracle and the wall follower too.
 
     Raises:
-        ValueError: a map is unusable for a robot, runs cannot be told apart, or the file cannot be
-            written.
+        ValueError: a map is unusable for a robot, two runs have the same name, or the file
+            cannot be written.
     """
     content = gather_content(runs, settings, baselines=baselines)
     write_page(out, to_html(content, draw_pictures(content)))

@@ -90,7 +90,7 @@ def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) 
     """Evaluate the runs with a progress bar.
 
     Raises:
-        ValueError: a map is unusable for a robot, or runs cannot be told apart.
+        ValueError: a map is unusable for a robot, or two runs have the same name.
     """
     trained = group_policies([run.policy for run in runs])
     for name, count in Counter(agent.name for agent in trained).items():

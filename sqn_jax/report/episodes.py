@@ -61,8 +61,8 @@ class WorstEpisode:
         return int(self.batch.main_metrics.time_steps[self.episode])
 
     @property
-    def refused(self) -> int:
-        """Number of moves refused within these steps."""
+    def collisions(self) -> int:
+        """Number of collisions, moves that were refused, within these steps."""
         return int(self.batch.trajectory.info["collision"][: self.steps, self.episode].sum())
 
     @property

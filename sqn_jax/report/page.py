@@ -133,7 +133,7 @@ def lead(content: Content) -> str:
     parts = []
     for agent in content.agents:
         results = [
-            f"{entry['success']['mean']:.2f} on {_world(entry, content.settings)} "
+            f"{entry['success']['mean']:.2f} in {_world(entry, content.settings)} "
             f"({entry['time_steps']['mean']:,.0f} steps)"
             for entry in content.evaluation["results"]
             if entry["agent"] == agent.name
@@ -219,13 +219,15 @@ def describe_episode(worst: WorstEpisode) -> str:
             f"The shortest path to the goal was {_meters(worst.shortest_path)} from the start and "
             f"{_meters(worst.remaining_path)} from the end."
         )
-    moves = {0: "No move was", 1: "1 move was"}.get(worst.refused, f"{worst.refused:,} moves were")
+    collisions = {0: "no collision", 1: "1 collision"}
+    outcome += f" There {'was' if worst.collisions < 2 else 'were'} "
+    outcome += f"{collisions.get(worst.collisions, f'{worst.collisions:,} collisions')}."
     return (
-        f"{batch.agent.name}, training seed {batch.training_seed}, on "
+        f"{batch.agent.name}, training seed {batch.training_seed}, in "
         f"{batch.world.occupancy_map.name} "
         f"({batch.world.tasks}, episode {worst.episode} of evaluation seed {batch.eval_seed}): "
         f"from ({start[0]:.1f}, {start[1]:.1f}) m to the goal at ({goal[0]:.1f}, {goal[1]:.1f}) m. "
-        f"{outcome} {moves} refused."
+        f"{outcome}"
     )
 
 

@@ -65,7 +65,7 @@ def draw_pictures(content: Content) -> Illustrations:
 
 
 def _title(batch: EpisodeBatch) -> str:
-    return f"{batch.agent.name} on {batch.world.occupancy_map.name}, {batch.world.tasks}"
+    return f"{batch.agent.name}, {batch.world.occupancy_map.name}, {batch.world.tasks}"
 
 
 def _trajectories(batch: EpisodeBatch, chosen: slice, title: str) -> Any:
@@ -104,7 +104,11 @@ def _mark(axes: Any, place: Place, *, is_stuck: bool) -> None:
     for color, width in ((_PAPER, 4.5), (_INK, 2.0)):
         x, y = place.x + NEAR * np.cos(angles), place.y + NEAR * np.sin(angles)
         axes.plot(x, y, color=color, lw=width, zorder=8)
-    (left, right), (_, top) = axes.get_xlim(), axes.get_ylim()
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    edge = 1.1 * NEAR  # Near the border of the map the panel grows, so that no circle is cut.
+    left, right = min(left, place.x - edge), max(right, place.x + edge)
+    bottom, top = min(bottom, place.y - edge), max(top, place.y + edge)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     is_above = place.y + NEAR < 0.9 * top
     fraction = (place.x - left) / (right - left)
     axes.annotate(
@@ -129,7 +133,7 @@ def curves(content: Content) -> list[Illustration]:
         return []
     if len(runs) == 1:
         (run,) = runs
-        figure = figures.learning_curve(run.metrics, title=f"Training of {run.name}")
+        figure = figures.learning_curve(run.metrics, title=run.name)
         return [_curve(figure, "Reward, success, loss and, with several skills, their weights.")]
     rows = {id(run.policy): run.metrics for run in runs}
     by_agent = {
@@ -139,7 +143,7 @@ def curves(content: Content) -> list[Illustration]:
     by_agent = {name: rows_of_runs for name, rows_of_runs in by_agent.items() if rows_of_runs}
     pictures = [
         _curve(
-            figures.learning_curves(by_agent, title="Training"),
+            figures.learning_curves(by_agent, title="All agents"),
             "Mean reward and success under exploration noise; if an agent has several training "
             "seeds, the line is their mean and the band its 95 % interval.",
         )

@@ -164,7 +164,7 @@ def _draw(
     jobs: dict[Path, Callable[[Path], None]] = {}
     jobs[out / "trajectories.png"] = partial(_draw_paths, recorded, f"{map_name}, {tasks}")
     for name, episodes in recorded.items():
-        title = f"{name} on {map_name}, {tasks}, episode 1"
+        title = f"{name}, {map_name}, {tasks}, episode 1"
         file = _file_name(name)
         jobs[out / f"{file}_timeline_1.png"] = partial(_draw_timeline, episodes[0], title)
         for number, episode in enumerate(episodes[:animations], start=1):
@@ -187,7 +187,7 @@ def _draw_paths(recorded: EpisodesByAgent, title: str, path: Path) -> None:
     """The paths of one agent on one map, or of several agents task by task."""
     if len(recorded) == 1:
         ((name, episodes),) = recorded.items()
-        figures.save(figures.skill_trajectories(episodes, title=f"{name} on {title}"), path)
+        figures.save(figures.skill_trajectories(episodes, title=f"{name}, {title}"), path)
         return
     first = {name: episodes[:MAX_TASKS] for name, episodes in recorded.items()}
     count = max(len(episodes) for episodes in recorded.values())

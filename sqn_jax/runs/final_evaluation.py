@@ -93,7 +93,7 @@ def draw_figures(
     except ImportError:
         say("no figures: Matplotlib is not installed (pip install 'sqn_jax[viz]')")
         return False
-    name = f"{config.algo.upper()} on {occupancy_map.name}"
+    name = f"{config.algo.upper()}, {occupancy_map.name}"
     if (count := len(config.maps.names)) > 1:
         name += f" (trained on {count} maps)"
     curve = figures.learning_curve(folder.read_metrics(), title=name)

@@ -33,7 +33,7 @@ from sqn_jax.storage.run_folder import CHECKPOINTS
 from sqn_jax.training.state import RunnerState
 
 NUM_NEWEST = 2
-"""How many of the newest are kept; the best one besides."""
+"""How many of the newest stay on the disk; the best one besides."""
 
 OVERHEAD_BYTES = 2**21
 """What a checkpoint takes besides its arrays, at most: some fifty small files, and the manifest."""
@@ -80,7 +80,7 @@ class Checkpoints:
         Args:
             chunk: chunks done.
             runner: the state.
-            score: success in training since the checkpoint before; the best one is kept.
+            score: success in training since the checkpoint before; the best one stays.
             light: leave out the replay, where there is one.
 
         Raises:

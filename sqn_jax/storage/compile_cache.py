@@ -112,7 +112,7 @@ def _open_folder(chosen: str) -> Path | None:
         fault = f"{error.filename}: {error.strerror}" if error.filename else str(error)
     except (RuntimeError, ValueError) as error:  # Nobody's home, a circle of links, NUL.
         fault = str(error)
-    say(f"compiled programs are not kept: {fault}", error=True)
+    say(f"compiled programs are not cached: {fault}", error=True)
     return None
 
 

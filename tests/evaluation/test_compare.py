@@ -102,7 +102,7 @@ def test_every_agent_meets_the_same_tasks_under_every_noise(
 def test_the_policy_is_the_one_the_training_ended_with(run_dir: Path, tmp_path: Path) -> None:
     """The same episodes as in the run's own evaluation, from the run folder alone."""
     words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", "4", "--eval-seeds", "1"]
-    words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-references"]
+    words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-baselines"]
     assert main([*words, "--out", str(tmp_path / "again.json")]) == 0
     again = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
     own = [json.loads(line) for line in (run_dir / "evaluation.jsonl").read_text().splitlines()]
@@ -157,7 +157,7 @@ def test_the_step_limit_is_the_map_s_whatever_the_run_was_trained_with(
     run_dir: Path, tmp_path: Path
 ) -> None:
     words = ["evaluate", str(run_dir), "--maps", "column", "--episodes", "1", "--eval-seeds", "1"]
-    assert main([*words, "--no-references", "--out", str(tmp_path / "found.json")]) == 0
+    assert main([*words, "--no-baselines", "--out", str(tmp_path / "found.json")]) == 0
     lines = (tmp_path / "found.jsonl").read_text().splitlines()
     failures = [record for record in map(json.loads, lines) if not record["success"]]
     assert {record["time_steps"] for record in failures} == {load_map("column").max_steps}
@@ -186,11 +186,11 @@ def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
 ) -> None:
     def refusal(words: list[str]) -> str:
         capsys.readouterr()
-        assert main(["evaluate", *words, "--no-references", "--episodes", "1"]) == 2
-        told = capsys.readouterr().err
-        assert told.startswith("sqn: ")
-        assert told.count("\n") == 1, told
-        return told
+        assert main(["evaluate", *words, "--no-baselines", "--episodes", "1"]) == 2
+        stderr = capsys.readouterr().err
+        assert stderr.startswith("sqn: ")
+        assert stderr.count("\n") == 1, stderr
+        return stderr
 
     no_yaml = tmp_path / "bad.yaml"
     no_yaml.write_text("image: [")
@@ -220,9 +220,9 @@ def test_a_damaged_array_of_a_checkpoint_is_one_line(run_dir: Path, tmp_path: Pa
     program = [sys.executable, "-m", "sqn_jax", *words]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
-    told = [line for line in done.stderr.splitlines() if line.startswith("sqn: ")]
-    assert len(told) == 1
-    assert "damaged" in told[0]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("sqn: ")]
+    assert len(lines) == 1
+    assert "damaged" in lines[0]
 
 
 def test_a_run_without_a_checkpoint_is_named(
@@ -240,7 +240,7 @@ def test_a_run_without_a_checkpoint_is_named(
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (["--no-references"], ["run folder"]),
+        (["--no-baselines"], ["run folder"]),
         (["nowhere"], ["nowhere", "holds no run"]),
         (["--episodes", "0"], ["episodes", "0", "at least 1"]),
         (["--episodes", "1000000000000"], ["episodes", "1000000000000", "at most"]),
@@ -266,9 +266,9 @@ def test_wrong_words_of_evaluate_are_named_in_one_line(
     capsys: pytest.CaptureFixture[str], words: list[str], names: list[str]
 ) -> None:
     assert main(["evaluate", *words]) == 2
-    told = capsys.readouterr().err
-    lines = [line for line in told.splitlines() if line.startswith("sqn: ")]
+    stderr = capsys.readouterr().err
+    lines = [line for line in stderr.splitlines() if line.startswith("sqn: ")]
     assert len(lines) == 1
-    assert "Traceback" not in told
+    assert "Traceback" not in stderr
     for name in names:
-        assert name in lines[0], (name, told)
+        assert name in lines[0], (name, stderr)

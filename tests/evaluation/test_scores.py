@@ -48,15 +48,15 @@ def batch(
 
 
 def test_failures_count_at_the_limit_and_are_left_out_of_the_successes() -> None:
-    told = describe([batch(0, 1000, [True, False, True, True])], RADIUS)
-    assert told["success"]["mean"] == 0.75
-    assert told["time_steps"]["mean"] == (10 + 400 + 30 + 40) / 4
-    assert told["time_steps_success"]["mean"] == (10 + 30 + 40) / 3
-    assert told["spl"]["mean"] == pytest.approx(3 / 4 * 6 / 8)
-    assert told["collisions"]["mean"] == 1.5
-    assert told["coverage_m2"]["mean"] == 7.0
-    assert told["success_per_seed"] == [0.75]
-    assert "iqm" not in told["success"], "one training seed has no spread over training seeds"
+    metrics = describe([batch(0, 1000, [True, False, True, True])], RADIUS)
+    assert metrics["success"]["mean"] == 0.75
+    assert metrics["time_steps"]["mean"] == (10 + 400 + 30 + 40) / 4
+    assert metrics["time_steps_success"]["mean"] == (10 + 30 + 40) / 3
+    assert metrics["spl"]["mean"] == pytest.approx(3 / 4 * 6 / 8)
+    assert metrics["collisions"]["mean"] == 1.5
+    assert metrics["coverage_m2"]["mean"] == 7.0
+    assert metrics["success_per_seed"] == [0.75]
+    assert "iqm" not in metrics["success"], "one training seed has no spread over training seeds"
 
 
 def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> None:
@@ -70,30 +70,30 @@ def test_steps_over_the_oracle_s_are_those_of_tasks_in_which_both_arrive() -> No
         batch(None, 1001, [True, False, True, True], time_steps=np.array([8, 400, 9, 9])),
         batch(None, 1000, [True, True, True, True], time_steps=np.array([5, 10, 20, 40])),
     ]
-    told = describe(ours, RADIUS, oracle)["steps_over_oracle"]
+    metrics = describe(ours, RADIUS, oracle)["steps_over_oracle"]
     expected = [10 / 5, 30 / 20, 40 / 40, 10 / 5, 20 / 10, 10 / 8]
-    assert told["mean"] == pytest.approx(np.mean(expected))
-    assert told["std"] == pytest.approx(np.std(expected, ddof=1))
+    assert metrics["mean"] == pytest.approx(np.mean(expected))
+    assert metrics["std"] == pytest.approx(np.std(expected, ddof=1))
     assert describe(ours, RADIUS)["steps_over_oracle"] is None
     nowhere = batch(0, 1000, [False] * 4)
     assert describe([nowhere], RADIUS, oracle)["steps_over_oracle"] is None
 
 
 def test_the_paper_s_spread_is_that_of_the_means_of_the_evaluation_seeds() -> None:
-    told = describe(
+    metrics = describe(
         [batch(0, 1000, [True, True, True, True]), batch(0, 1001, [True, False, False, True])],
         RADIUS,
     )
-    assert told["success"]["mean"] == 0.75
+    assert metrics["success"]["mean"] == 0.75
     # Means 1 and 0.5; six successes in eight episodes. Divided by n - 1.
-    assert told["success"]["std_of_means"] == pytest.approx(np.sqrt(2 * 0.25**2 / 1))
-    assert told["success"]["std"] == pytest.approx(np.sqrt(8 * 0.75 * 0.25 / 7))
+    assert metrics["success"]["std_of_means"] == pytest.approx(np.sqrt(2 * 0.25**2 / 1))
+    assert metrics["success"]["std"] == pytest.approx(np.sqrt(8 * 0.75 * 0.25 / 7))
 
 
 def test_a_single_seed_has_no_spread() -> None:
-    told = describe([batch(0, 1000, [True, False])], RADIUS)
-    assert told["success"]["std_of_means"] is None
-    assert told["success"]["std"] == pytest.approx(np.sqrt(0.5))
+    metrics = describe([batch(0, 1000, [True, False])], RADIUS)
+    assert metrics["success"]["std_of_means"] is None
+    assert metrics["success"]["std"] == pytest.approx(np.sqrt(0.5))
     alone = describe([batch(0, 1000, [True])], RADIUS)
     assert alone["time_steps"]["std"] is None
     assert alone["time_steps_success"]["std"] is None
@@ -101,26 +101,26 @@ def test_a_single_seed_has_no_spread() -> None:
 
 def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
     rates = ([True, True], [True, False], [False, False], [True, True])
-    told = describe([batch(seed, 1000, rate) for seed, rate in enumerate(rates)], RADIUS)
-    assert told["success_per_seed"] == [1.0, 0.5, 0.0, 1.0]
-    assert told["success"]["iqm"] == pytest.approx((0.5 + 1.0) / 2)
-    low, high = told["success"]["iqm_ci95"]
+    metrics = describe([batch(seed, 1000, rate) for seed, rate in enumerate(rates)], RADIUS)
+    assert metrics["success_per_seed"] == [1.0, 0.5, 0.0, 1.0]
+    assert metrics["success"]["iqm"] == pytest.approx((0.5 + 1.0) / 2)
+    low, high = metrics["success"]["iqm_ci95"]
     assert 0 <= low < 0.75 < high <= 1
 
 
 def test_no_success_and_no_shortest_way_are_said_and_not_made_up() -> None:
     lost = batch(None, 1000, [False, False])
     blind = dataclasses.replace(lost, shortest_paths=None)
-    told = describe([blind], RADIUS)
-    assert told["time_steps_success"] is None
-    assert told["spl"] is None
+    metrics = describe([blind], RADIUS)
+    assert metrics["time_steps_success"] is None
+    assert metrics["spl"] is None
 
 
 def test_improvement_needs_several_training_seeds_of_both() -> None:
     good = [[batch(seed, 1000, [True, True]) for seed in range(3)]]
     bad = [[batch(seed, 1000, [seed == 0, False]) for seed in range(3)]]
-    told = improvement(good, bad, RADIUS)
-    assert told["probability"] == 1.0
+    comparison = improvement(good, bad, RADIUS)
+    assert comparison["probability"] == 1.0
     assert improvement(bad, good, RADIUS)["probability"] == 0.0
     assert improvement(good, good, RADIUS)["probability"] == 0.5
     assert improvement(good, [[batch(None, 1000, [True, True])]], RADIUS) is None

@@ -159,11 +159,11 @@ def test_rare_colours_that_mean_something_keep_their_place_in_a_palette() -> Non
     for colour in (ROBOT, SEEN, WALL, STAR, BLUE, VERMILLION, GREEN, RED, (255, 255, 255)):
         (index,) = palette.indices(np.array([[colour]], np.uint8))[0]
         assert tuple(palette.table[index]) == colour
-    told = palette.indices(noise)
+    nearest = palette.indices(noise)
     apart = np.abs(noise[:, :, None].astype(int) - palette.table[None, None, :255]).sum(axis=-1)
-    chosen = np.take_along_axis(apart, told[..., None].astype(int), axis=2)[..., 0]
+    chosen = np.take_along_axis(apart, nearest[..., None].astype(int), axis=2)[..., 0]
     assert (chosen <= 2 * apart.min(axis=-1)).all()
-    assert told.max() < 255
+    assert nearest.max() < 255
 
 
 def test_an_mp4_has_the_frames_asked_for_and_a_second_at_its_end(tmp_path: Path) -> None:

@@ -45,10 +45,10 @@ def test_a_line_is_the_mean_over_runs_and_seeds_with_a_band_around_it() -> None:
 
 
 def entry(agent: str, velocity: float, ranges: float, success: float) -> dict[str, Any]:
-    told = {"mean": success, "ci95": [success - 0.1, success + 0.05]}
+    summary = {"mean": success, "ci95": [success - 0.1, success + 0.05]}
     noise = {"velocity_noise": velocity, "range_noise": ranges}
     units = {"velocity_noise_unit": "relative", "range_noise_unit": "relative"}
-    return {"agent": agent, "success": told, **noise, **units}
+    return {"agent": agent, "success": summary, **noise, **units}
 
 
 def test_each_panel_has_its_noise_and_starts_without_any() -> None:
@@ -147,13 +147,13 @@ def test_patterns_without_episodes_or_with_too_many_scans_are_refused(scans: int
 
 
 def gate_rows(entropies: list[Any], skills: int = 2, **more: list[Any]) -> list[dict[str, Any]]:
-    told = [
+    rows = [
         {"episodes": 100 * k, "gate_entropy": entropy, "skill_usage": [1 / skills] * skills}
         for k, entropy in enumerate(entropies, start=1)
     ]
     for name, values in more.items():
-        told = [row | {name: value} for row, value in zip(told, values, strict=True)]
-    return told
+        rows = [row | {name: value} for row, value in zip(rows, values, strict=True)]
+    return rows
 
 
 @pytest.mark.usefixtures("full_pixels")

@@ -130,8 +130,8 @@ def moments(**changes: Any) -> Episode:
 def test_the_nearest_hidden_moment_stands_beside_a_reachable_one_as_far_away() -> None:
     """Hidden at 4, 3 and 2 m; in sight at 1.5, 3.2 and 2.4 m: 2 m and 2.4 m belong together."""
     hidden, reachable = panels(drawn(figures.reachability_example(moments())))
-    assert hidden.get_title() == "goal 2.0 m away, hidden, not reachable"
-    assert reachable.get_title() == "goal 2.4 m away, reachable"
+    assert hidden.get_title() == "Goal 2.0 m away, hidden"
+    assert reachable.get_title() == "Goal 2.4 m away, in sight"
     # After steps 3 and 6, counted from 1.
     for axes, solid, reach in ((hidden, False, 0.83), (reachable, True, 4.56)):
         (line,) = [line for line in axes.lines if len(line.get_xdata()) == 2]
@@ -148,10 +148,10 @@ def test_a_corner_that_hides_the_goal_from_one_beam_only_is_a_last_resort() -> N
     ranges = one.ranges.copy()
     ranges[3, 18] = 4.5  # of 36 beams 10 degrees apart, 5 degrees to the left
     hidden, _ = panels(figures.reachability_example(changed(one, ranges=ranges)))
-    assert hidden.get_title().startswith("goal 3.0 m away")
+    assert hidden.get_title().startswith("Goal 3.0 m away")
     ranges[1:4, 18] = 4.5
     hidden, _ = panels(figures.reachability_example(changed(one, ranges=ranges)))
-    assert hidden.get_title().startswith("goal 2.0 m away"), "all are doubtful, the nearest counts"
+    assert hidden.get_title().startswith("Goal 2.0 m away"), "all are doubtful, the nearest counts"
 
 
 def test_goals_behind_the_robot_or_beyond_the_sensor_are_not_called_hidden() -> None:
@@ -160,7 +160,7 @@ def test_goals_behind_the_robot_or_beyond_the_sensor_are_not_called_hidden() -> 
     poses[3, 2] = math.pi  # the goal lies in the blind angle of step 3
     turned = changed(one, poses=poses)
     hidden, _ = panels(figures.reachability_example(turned))
-    assert hidden.get_title().startswith("goal 3.0 m away")
+    assert hidden.get_title().startswith("Goal 3.0 m away")
     far = moments(goal_distances=np.array([5.5, 6.0, 7.0, 1.5, 3.2, 2.4, 0.2, 0.1]))
     with pytest.raises(ValueError, match="1 episode: the goal is never near but hidden"):
         figures.reachability_example(far)

@@ -29,18 +29,18 @@ def test_the_curves_are_the_rows():
     figure = figures.learning_curve(rows, title="a run")
     expected = {
         "reward": [0.1, 0.3, 0.5, 0.7, 0.9],
-        "loss": [0.5, 0.25, 0.5 / 3, 0.125, 0.1],
+        "Loss": [0.5, 0.25, 0.5 / 3, 0.125, 0.1],
     }
     for title, values in expected.items():
         (line,) = panel(figure, title).lines
         np.testing.assert_allclose(line.get_ydata(), values)
         np.testing.assert_array_equal(line.get_xdata(), [100, 200, 300, 400, 500])
-    success = panel(figure, "success")
+    success = panel(figure, "Success")
     np.testing.assert_allclose(curve(success, "success").get_ydata(), [0.1, 0.2, 0.3, 0.4, 0.5])
     np.testing.assert_allclose(
-        curve(success, "random actions").get_ydata(), [0.46, 0.42, 0.38, 0.34, 0.30]
+        curve(success, "epsilon (random actions)").get_ydata(), [0.46, 0.42, 0.38, 0.34, 0.30]
     )
-    skills = panel(figure, "skills")
+    skills = panel(figure, "Skill")
     np.testing.assert_allclose(curve(skills, "skill 1").get_ydata(), [0.1, 0.2, 0.3, 0.4, 0.5])
     np.testing.assert_allclose(curve(skills, "skill 2").get_ydata(), [0.9, 0.8, 0.7, 0.6, 0.5])
     entropy = curve(skills, "gate entropy / log 2").get_ydata()
@@ -50,8 +50,8 @@ def test_the_curves_are_the_rows():
 
 def test_training_success_is_said_to_be_under_exploration_noise():
     figure = figures.learning_curve([row(1), row(2)], title="a run")
-    axes = panel(figure, "success")
-    assert "exploration noise" in axes.get_title()
+    axes = panel(figure, "Success")
+    assert "exploring" in axes.get_title()
     low, high = axes.get_ylim()
     assert low <= 0
     assert high >= 1
@@ -71,7 +71,7 @@ def test_one_skill_has_no_panel_for_skills():
     rows = [row(c, skill_usage=[1.0], gate_entropy=0.0) for c in (1, 2)]
     figure = figures.learning_curve(rows, title="R2D2")
     assert len(figure.axes) == 3
-    assert not any("skill" in axes.get_title() for axes in figure.axes)
+    assert not any("Skill" in axes.get_title() for axes in figure.axes)
     assert len(figures.learning_curve([row(1), row(2)], title="SQN").axes) == 4
 
 
@@ -93,7 +93,7 @@ def test_each_seed_is_thin_and_the_mean_is_bold():
     np.testing.assert_allclose(bold.get_ydata(), [0.1, 0.3, 0.5])
     np.testing.assert_allclose(thin[0].get_ydata(), [0.09, 0.29, 0.49])
     np.testing.assert_allclose(thin[2].get_ydata(), [0.11, 0.31, 0.51])
-    skills = panel(figure, "skills")
+    skills = panel(figure, "Skill")
     np.testing.assert_allclose(curve(skills, "skill 2").get_ydata(), [0.9, 0.8, 0.7])
     assert len(skills.lines) == 3 * (3 + 1)
     assert "3 seeds" in figure.get_suptitle()
@@ -102,26 +102,26 @@ def test_each_seed_is_thin_and_the_mean_is_bold():
 @pytest.mark.parametrize("nothing", [math.nan, None], ids=["nan", "null"])
 def test_losses_before_the_first_update_leave_a_gap(nothing):
     rows = [row(1, loss=nothing, gate_entropy=nothing), row(2), row(3)]
-    (line,) = panel(drawn(figures.learning_curve(rows, title="a run")), "loss").lines
+    (line,) = panel(drawn(figures.learning_curve(rows, title="a run")), "Loss").lines
     np.testing.assert_allclose(line.get_ydata(), [np.nan, 0.25, 0.5 / 3])
     assert line.axes.get_yscale() == "log"
 
 
 def test_a_seed_without_a_loss_does_not_spoil_the_mean_of_the_others():
     rows = [seeds_row(1) | {"loss": [math.nan] * 3}, seeds_row(2) | {"loss": [0.2, math.nan, 0.4]}]
-    line = panel(drawn(figures.learning_curve(rows, title="seeds")), "loss").lines[-1]
+    line = panel(drawn(figures.learning_curve(rows, title="seeds")), "Loss").lines[-1]
     np.testing.assert_allclose(line.get_ydata(), [np.nan, 0.3])
 
 
 def test_a_run_that_has_not_learned_yet_can_be_drawn():
     rows = [row(c, loss=None, gate_entropy=None) for c in (1, 2)]
-    axes = panel(drawn(figures.learning_curve(rows, title="a run")), "loss")
+    axes = panel(drawn(figures.learning_curve(rows, title="a run")), "Loss")
     assert [text.get_text() for text in axes.texts] == ["no update yet"]
 
 
 def test_a_loss_that_is_not_positive_has_a_linear_scale():
     rows = [row(1, loss=0.5), row(2, loss=0.0)]
-    assert panel(figures.learning_curve(rows, title="a run"), "loss").get_yscale() == "linear"
+    assert panel(figures.learning_curve(rows, title="a run"), "Loss").get_yscale() == "linear"
 
 
 @pytest.mark.parametrize("make", [row, seeds_row])
@@ -162,4 +162,4 @@ def test_no_text_of_a_learning_curve_overlaps_another(skills, make):
     rows = [make(chunk) for chunk in range(1, 9)]
     usage = np.broadcast_to(1 / skills, (3, skills)).tolist()
     rows = [r | {"skill_usage": usage if make is seeds_row else usage[0]} for r in rows]
-    check_texts(drawn(figures.learning_curve(rows, title="SQN on maze")))
+    check_texts(drawn(figures.learning_curve(rows, title="SQN, maze")))

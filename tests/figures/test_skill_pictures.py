@@ -117,8 +117,8 @@ def two_tasks(skills: int, arrival: int) -> list[Episode]:
 def test_rows_are_tasks_and_columns_are_agents() -> None:
     agents = {"SQN": two_tasks(2, 12), "R2D2": two_tasks(1, 15)}
     figure = drawn(figures.agents_side_by_side(agents, title="side by side"))
-    told = [axes.get_title() for axes in panels(figure)]
-    assert told == ["SQN: 12 steps", "R2D2: 15 steps", "SQN: not reached", "R2D2: not reached"]
+    titles = [axes.get_title() for axes in panels(figure)]
+    assert titles == ["SQN: 12 steps", "R2D2: 15 steps", "SQN: not reached", "R2D2: not reached"]
     boxes = [axes.get_window_extent() for axes in panels(figure)]
     assert boxes[0].x0 < boxes[1].x0
     assert boxes[0].y0 > boxes[2].y0

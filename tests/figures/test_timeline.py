@@ -76,7 +76,7 @@ def test_reachable_times_are_shaded_and_refused_moves_ticked() -> None:
     unremarkable = figures.episode_timeline(
         episode(reachable=np.zeros(30, dtype=bool)), title="SQN"
     )
-    assert not {"goal reachable", "move refused"} & labelled(unremarkable.axes[-1]).keys()
+    assert not {"goal in sight", "collision"} & labelled(unremarkable.axes[-1]).keys()
 
 
 @pytest.mark.parametrize("arrival", [12, 0])

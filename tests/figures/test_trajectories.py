@@ -109,7 +109,7 @@ def test_the_ends_of_the_weight_scale_differ_in_brightness():
 
 def test_one_skill_has_one_colour_and_no_scale_for_it():
     figure = draw(episodes(GOALS[:1] * 2, [True, False], [12, 30], skills=1))
-    assert colorbar_labels(figure) == {"distance to the goal, m"}
+    assert colorbar_labels(figure) == {"path to the goal, m"}
     all_paths = [path for axes in panels(figure) for path in drawn_paths(axes)]
     assert all(path.get_array() is None for path in all_paths)
     assert len({to_rgb(colour) for path in all_paths for colour in path.get_colors()}) == 1
@@ -130,7 +130,7 @@ def test_titles_count_all_episodes_and_average_the_steps_of_the_successes():
 def test_the_background_is_the_distance_to_the_goal():
     """Rows run upwards, the wall and the closed box have no distance, and the scale is in m."""
     figure = draw(episodes([GOALS[1], GOALS[3]], [True, True], [5, 5]))
-    assert "distance to the goal, m" in colorbar_labels(figure)
+    assert "path to the goal, m" in colorbar_labels(figure)
     for axes, goal in zip(panels(figure), [GOALS[1], GOALS[3]], strict=True):
         ground, field = axes.images
         for image in (ground, field):

@@ -60,8 +60,8 @@ def test_every_agent_gets_its_films_and_pictures(
         "sqn_two_timeline_1.png",
         "trajectories.png",
     ]
-    told = capsys.readouterr().out.splitlines()
-    said = {line.split()[1] for line in told if line.startswith("wrote ")}
+    lines = capsys.readouterr().out.splitlines()
+    said = {line.split()[1] for line in lines if line.startswith("wrote ")}
     assert said == {f"deep/pictures/{name}" for name in written}
     films = []
     for agent in ("one", "two"):
@@ -124,12 +124,12 @@ def test_wrong_words_of_render_are_named_in_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, words: list[str], names: list[str]
 ) -> None:
     assert main(["render", *words]) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith("sqn: ")
-    assert told.err.count("\n") == 1, told.err
+    output = capsys.readouterr()
+    assert output.err.startswith("sqn: ")
+    assert output.err.count("\n") == 1, output.err
     for name in names:
-        assert name in told.err, (name, told.err)
-    assert told.out == ""
+        assert name in output.err, (name, output.err)
+    assert output.out == ""
     assert list(tmp_path.iterdir()) == []
 
 
@@ -160,9 +160,9 @@ def test_a_missing_library_is_one_line_with_the_name_of_the_extra(
     monkeypatch.delattr(sqn_jax, "figures", raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
     assert main(["render", "pretrained:one", "--mp4"]) == 2
-    told = capsys.readouterr().err
-    assert extra in told
-    assert told.count("\n") == 1, told
+    stderr = capsys.readouterr().err
+    assert extra in stderr
+    assert stderr.count("\n") == 1, stderr
 
 
 def test_evaluate_takes_pretrained_policies_too(capsys: pytest.CaptureFixture[str]) -> None:

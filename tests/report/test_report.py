@@ -216,13 +216,15 @@ def test_the_words_say_where_a_robot_was_stuck_for_how_long_and_how_far_off() ->
     # 12 steps, the last six of which: four at (8, 1), then away by 2 m. Before, all at (2, 1).
     path = [(2.04, 1.04)] * 7 + [(8.04, 1.04)] * 4 + [(6.04, 1.04)] * 2
     (hard,) = worst_episodes([batch_of(world, [path], [(9.04, 1.04)], [0])])
-    told = describe_episode(hard)
-    assert "not reached within 12 steps" in told
-    assert "stuck: it spent 4 of the last 6 steps within 1 m of (8.0, 1.0) m" in told
-    assert "shortest path to the goal was 7.0 m from the start and 3.0 m from the end" in told
-    assert "from (2.0, 1.0) m to the goal at (9.0, 1.0) m" in told
-    assert "4 moves were refused" in told
-    assert "sqn, training seed 4, on hall (evaluation points, episode 0" in told
+    description = describe_episode(hard)
+    assert "not reached within 12 steps" in description
+    assert "stuck: it spent 4 of the last 6 steps within 1 m of (8.0, 1.0) m" in description
+    assert (
+        "shortest path to the goal was 7.0 m from the start and 3.0 m from the end" in description
+    )
+    assert "from (2.0, 1.0) m to the goal at (9.0, 1.0) m" in description
+    assert "There were 4 collisions." in description
+    assert "sqn, training seed 4, in hall (evaluation points, episode 0" in description
 
 
 def test_a_robot_that_was_nowhere_for_long_is_not_called_stuck() -> None:
@@ -241,7 +243,7 @@ def test_of_a_success_only_the_way_to_the_goal_counts() -> None:
     (hard,) = worst_episodes([batch_of(world, [path], [(8.05, 1.05)], [4])])
     assert (hard.place.steps, hard.place.of) == (3, 4)
     assert hard.place.x == pytest.approx(2.05)
-    assert hard.refused == 1  # The third move; the others came after the arrival.
+    assert hard.collisions == 1  # The third move; the others came after the arrival.
 
 
 def entry(agent: str, name: str, success: float, steps: float) -> dict[str, Any]:
@@ -328,7 +330,7 @@ def test_the_first_sentence_tells_success_and_steps_of_each_map() -> None:
         settings=Settings(maps=("maze", "hall")),
     )
     assert (
-        lead(content) == "sqn has success 0.75 on maze (123 steps) and 0.25 on hall (1,234 steps)."
+        lead(content) == "sqn has success 0.75 in maze (123 steps) and 0.25 in hall (1,234 steps)."
     )
 
 
@@ -373,9 +375,9 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
 def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
     run_dir: Path, room_file: Path, tmp_path: Path
 ) -> None:
-    told = [str(run_dir), "--episodes", "2", "--eval-seeds", "1"]
+    arguments = [str(run_dir), "--episodes", "2", "--eval-seeds", "1"]
     for name in ("a.html", "b.html"):
-        assert main(["report", *told, "--out", str(tmp_path / name)]) == 0
+        assert main(["report", *arguments, "--out", str(tmp_path / name)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "b.html"]
     html = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert html == (tmp_path / "b.html").read_text(encoding="utf-8")
@@ -386,8 +388,8 @@ def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
     assert [image.format for image in images] == ["PNG"] * 4 + ["GIF"]
     assert getattr(images[-1], "n_frames", 1) > 1
     found = tmp_path / "found.json"
-    told += ["--maps", str(room_file), "--goal-radius", "0.3"]
-    assert main(["evaluate", *told, "--out", str(found)]) == 0
+    arguments += ["--maps", str(room_file), "--goal-radius", "0.3"]
+    assert main(["evaluate", *arguments, "--out", str(found)]) == 0
     for name, row in (("sqn", "sqn"), ("oracle", "oracle (knows the map)")):
         own = next(
             each for each in json.loads(found.read_text())["results"] if each["agent"] == name
@@ -401,8 +403,8 @@ def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
 def test_one_run_has_its_curves_several_are_compared_and_one_without_metrics_has_none() -> None:
     def run(name: str, algo: Algorithm, rows: int, **without: Any) -> Run:
         row = {"mean_reward": 0.1, "success": 0.5, "gate_entropy": 0.6, "skill_usage": [0.5, 0.5]}
-        told = {key: value for key, value in row.items() if key not in without}
-        metrics = [{"episodes": 32 * chunk, **told} for chunk in range(1, rows + 1)]
+        remaining = {key: value for key, value in row.items() if key not in without}
+        metrics = [{"episodes": 32 * chunk, **remaining} for chunk in range(1, rows + 1)]
         return Run(name, Policy(name, TrainConfig(algo=algo), ({},)), metrics, {})
 
     def count(*runs: Run) -> int:
@@ -457,9 +459,9 @@ def test_wrong_words_of_report_are_named_in_one_line(
     capsys.readouterr()
     out = [] if "--out" in words else ["--out", str(tmp_path / "page.html")]
     assert main(["report", *[str(run_dir) if w == "RUN" else w for w in words], *out]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("sqn: ")
-    assert told.count("\n") == 1, told
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("sqn: ")
+    assert stderr.count("\n") == 1, stderr
     for name in names:
-        assert name in told, (name, told)
+        assert name in stderr, (name, stderr)
     assert list(tmp_path.iterdir()) == []

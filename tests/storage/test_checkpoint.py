@@ -107,10 +107,10 @@ def test_what_was_saved_comes_back_bit_for_bit(
     saved: Path, states: list[RunnerState], shapes: RunnerState
 ) -> None:
     with opened(saved) as checkpoints:
-        found, told = checkpoints.restore(shapes)
+        found, description = checkpoints.restore(shapes)
     assert_same(found, states[2])
-    assert told.is_exact
-    assert told.score == 0.5
+    assert description.is_exact
+    assert description.score == 0.5
     for averaged, expected in (
         (True, states[2].learner.target_params),
         (False, states[2].learner.params),
@@ -167,12 +167,12 @@ def test_any_damaged_file_is_named_and_the_older_checkpoint_taken(
         damage(step / name, rng)
         with (
             opened(folder) as checkpoints,
-            pytest.warns(UserWarning, match="going on from chunk 1") as told,
+            pytest.warns(UserWarning, match="going on from chunk 1") as warned,
         ):
             found, _ = checkpoints.restore(shapes)
-        assert len(told) == 1
-        assert name.as_posix() in str(told[0].message)
-        assert str(step) in str(told[0].message)
+        assert len(warned) == 1
+        assert name.as_posix() in str(warned[0].message)
+        assert str(step) in str(warned[0].message)
         assert_same(found, states[1])
         assert not step.exists()
         aside.rename(step)
@@ -241,14 +241,14 @@ def test_checkpoints_that_have_changed_places_are_noticed(
 def test_where_none_is_sound_each_is_named_and_stays(folder: Path, shapes: RunnerState) -> None:
     for chunk in ("1", "2"):
         (folder / "checkpoints" / chunk / "rest" / "_METADATA").unlink()
-    with opened(folder) as checkpoints, pytest.raises(ValueError, match="damaged") as told:
+    with opened(folder) as checkpoints, pytest.raises(ValueError, match="damaged") as error:
         checkpoints.restore(shapes)
-    assert str(told.value).count("rest/_METADATA is missing") == 2
+    assert str(error.value).count("rest/_METADATA is missing") == 2
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["1", "2"]
 
 
 @pytest.mark.parametrize(
-    "told",
+    "content",
     [
         {"contents": {"schema": 1}},
         {"contents": {"schema": 2}},
@@ -259,12 +259,12 @@ def test_where_none_is_sound_each_is_named_and_stays(folder: Path, shapes: Runne
     ],
 )
 def test_a_manifest_from_elsewhere_ends_in_one_line(
-    told: Any, folder: Path, shapes: RunnerState
+    content: Any, folder: Path, shapes: RunnerState
 ) -> None:
     """Sealed as it should be, with other contents."""
-    if isinstance(told, dict) and isinstance(told["contents"], dict):
-        told["sha256"] = manifest._contents_digest(told["contents"])
-    (folder / "checkpoints" / "2" / "manifest.json").write_text(json.dumps(told))
+    if isinstance(content, dict) and isinstance(content["contents"], dict):
+        content["sha256"] = manifest._contents_digest(content["contents"])
+    (folder / "checkpoints" / "2" / "manifest.json").write_text(json.dumps(content))
     with opened(folder) as checkpoints, pytest.raises(ValueError, match=r"manifest\.json"):
         checkpoints.restore_policy(params_shapes(config_for()), averaged=False)
 
@@ -293,9 +293,9 @@ def test_another_network_is_told_in_a_table_and_nothing_is_moved(
     folder: Path, world: EnvParams
 ) -> None:
     wide = dataclasses.replace(config_for(), network=NetworkConfig(hidden_size=16), seed=3)
-    with opened(folder, wide) as checkpoints, pytest.raises(Mismatch) as told:
+    with opened(folder, wide) as checkpoints, pytest.raises(Mismatch) as error:
         checkpoints.restore(loop.runner_shapes(world, loop.make_program(world, wide)))
-    lines = [line.split() for line in told.value.table.splitlines()]
+    lines = [line.split() for line in error.value.table.splitlines()]
     assert ["network.hidden_size", "8", "16"] in lines
     assert ["network.layer_norm", "True", "False"] in lines
     assert ["seed", "0", "3"] in lines
@@ -309,11 +309,11 @@ def test_another_form_of_the_state_is_told_array_by_array(folder: Path, world: E
     """As when another version of the program wrote it."""
     two_seeds = dataclasses.replace(config_for(), num_seeds=2)
     shapes = loop.runner_shapes(world, loop.make_program(world, two_seeds))
-    with opened(folder) as checkpoints, pytest.raises(Mismatch) as told:
+    with opened(folder) as checkpoints, pytest.raises(Mismatch) as error:
         checkpoints.restore(shapes)
-    assert "rest/round" in told.value.table
-    assert "int32 ()" in told.value.table
-    assert "int32 (2,)" in told.value.table
+    assert "rest/round" in error.value.table
+    assert "int32 ()" in error.value.table
+    assert "int32 (2,)" in error.value.table
 
 
 def test_settings_that_may_change_do_not_matter(folder: Path, shapes: RunnerState) -> None:
@@ -344,9 +344,9 @@ def test_a_setting_that_came_later_had_its_default_before(
 
 def test_settings_that_are_no_more_are_told(folder: Path, shapes: RunnerState) -> None:
     written_before_randomization(folder, old_setting=7)
-    with opened(folder) as checkpoints, pytest.raises(Mismatch) as told:
+    with opened(folder) as checkpoints, pytest.raises(Mismatch) as error:
         checkpoints.restore(shapes)
-    lines = [line.split() for line in told.value.table.splitlines()]
+    lines = [line.split() for line in error.value.table.splitlines()]
     assert ["old_setting", "7", "-"] in lines
     assert ["randomization.speed", "-", "0.0"] in lines
 
@@ -371,10 +371,10 @@ def test_another_map_is_noticed_but_not_where_it_lies(
     ):
         with (
             opened(tmp_path, world=other.identity()) as checkpoints,
-            pytest.raises(Mismatch) as told,
+            pytest.raises(Mismatch) as error,
         ):
             checkpoints.restore(shapes)
-        assert "map." in told.value.table
+        assert "map." in error.value.table
 
 
 # What is kept.
@@ -409,16 +409,16 @@ def test_a_light_checkpoint_leaves_out_the_replay_and_says_so(
 ) -> None:
     with opened(tmp_path) as checkpoints:
         checkpoints.save(1, states[1], light=True)
-        found, told = checkpoints.restore(shapes)
-    assert not told.is_exact
+        found, description = checkpoints.restore(shapes)
+    assert not description.is_exact
     assert found.learner.memory is None
     assert_same(found, without_replay(states[1]))
     assert not (tmp_path / "checkpoints" / "1" / "memory").exists()
     pqn = without_replay(states[2])
     with opened(tmp_path) as checkpoints:  # Without a replay there is nothing to leave out.
         checkpoints.save(2, pqn, light=True)
-        found, told = checkpoints.restore(without_replay(shapes))
-    assert told.is_exact
+        found, description = checkpoints.restore(without_replay(shapes))
+    assert description.is_exact
     assert_same(found, pqn)
 
 

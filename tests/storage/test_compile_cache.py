@@ -52,10 +52,10 @@ def refused(capsys: pytest.CaptureFixture[str]) -> str:
     """The one line that tells why there is no cache."""
     with cached_programs():
         assert cache_dir() is None
-    told = capsys.readouterr().err
-    assert told.startswith("compiled programs are not kept: ")
-    assert told.count("\n") == 1
-    return told
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("compiled programs are not cached: ")
+    assert stderr.count("\n") == 1
+    return stderr
 
 
 # Where.
@@ -257,9 +257,9 @@ def test_a_damaged_program_is_compiled_again(
             result, was_read = run_program(shift)
             assert not was_read
             np.testing.assert_array_equal(result, expected(shift))
-    told = capsys.readouterr().err
-    assert f"{filled}: {len(ours)} damaged" in told
-    assert told.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert f"{filled}: {len(ours)} damaged" in stderr
+    assert stderr.count("\n") == 1
     with cached_programs():
         assert run_program(1.0)[1]
     assert capsys.readouterr().err == ""
@@ -273,9 +273,9 @@ def test_an_entry_damaged_under_way_is_told_of_and_replaced(
             path.write_bytes(path.read_bytes()[:50])
         for shift in (1.0, 2.0):
             np.testing.assert_array_equal(run_program(shift)[0], expected(shift))
-    told = capsys.readouterr().err
-    assert f"compiled programs in {filled}: reading jit_" in told
-    assert told.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert f"compiled programs in {filled}: reading jit_" in stderr
+    assert stderr.count("\n") == 1
     with cached_programs():
         assert all(run_program(shift)[1] for shift in (1.0, 2.0))
 
@@ -301,10 +301,10 @@ def test_a_full_disk_is_told_of_once_and_leaves_no_pieces(
                 np.testing.assert_array_equal(run_program(shift)[0], expected(shift))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    told = capsys.readouterr().err
-    assert "writing jit_" in told
-    assert os.strerror(errno.EFBIG) in told
-    assert told.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert "writing jit_" in stderr
+    assert os.strerror(errno.EFBIG) in stderr
+    assert stderr.count("\n") == 1
     assert list(folder.iterdir()) == []
 
 
@@ -315,9 +315,9 @@ def test_a_folder_deleted_under_way_stops_nothing(
         assert run_program(1.0)[1]
         shutil.rmtree(filled)
         np.testing.assert_array_equal(run_program(3.0)[0], expected(3.0))
-    told = capsys.readouterr().err
-    assert os.strerror(errno.ENOENT) in told
-    assert told.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert os.strerror(errno.ENOENT) in stderr
+    assert stderr.count("\n") == 1
 
 
 def test_the_oldest_are_deleted_when_the_folder_is_full(

@@ -46,9 +46,9 @@ def test_the_lock_of_a_killed_process_keeps_nobody_off(
     with holder(tmp_path) as child:
         child.kill()
     with locked(tmp_path):
-        told = capsys.readouterr().err
-        assert told.startswith(f"process {child.pid} on ")
-        assert "did not end in order" in told
+        stderr = capsys.readouterr().err
+        assert stderr.startswith(f"process {child.pid} on ")
+        assert "did not end in order" in stderr
         assert f"process {os.getpid()} " in (tmp_path / NAME).read_text()
     with locked(tmp_path):
         assert capsys.readouterr().err == ""

@@ -32,7 +32,7 @@ def test_a_run_on_two_rooms_is_evaluated_on_the_first_and_resumed(
     assert code == 0, err
     assert "resuming after 2 of 3 chunks" in out
     capsys.readouterr()
-    words = ["--episodes", "1", "--eval-seeds", "1", "--no-references", "--max-steps", "12"]
+    words = ["--episodes", "1", "--eval-seeds", "1", "--no-baselines", "--max-steps", "12"]
     assert main(["evaluate", str(tmp_path / "both"), "--maps", f"{first},{second}", *words]) == 0
     told = capsys.readouterr().out
     assert "room" in told
