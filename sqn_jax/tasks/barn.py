@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sqn_jax.maps.files import named, one_line, read_at_most
 from sqn_jax.maps.occupancy import OccupancyMap
 from sqn_jax.tasks.convert import ConvertedMap, by_number, finite_number
-from sqn_jax.tasks.suite import Task
+from sqn_jax.tasks.suite import MAX_BODY, Task
 
 ROBOT_RADIUS = 0.33  # m
 SPEED = 2.0  # m/s
@@ -57,6 +57,8 @@ def read_barn(
     Raises:
         ValueError: one line that names the file and what is wrong with it.
     """
+    if not 0 <= robot_radius <= MAX_BODY:
+        raise ValueError(f"robot_radius: {robot_radius!r}, expected 0 to {MAX_BODY:g} m")
     paths = sorted(source.glob("world_*.world"), key=by_number)
     if not paths:
         raise ValueError(f"{named(source)}: no BARN worlds, expected a folder of world_*.world")

@@ -95,7 +95,7 @@ def write_converted(
         ValueError: one line that names the source of a task that cannot be solved, and why; or the
             files cannot be written.
     """
-    out = out.absolute().resolve()
+    out = out.absolute().parent.resolve() / out.name
     suite = TaskSuite(out.stem, (), robot, collision_ends)
     robot_radius = suite.robot_of(EnvConfig()).robot_radius
     folder = out.with_name(f"{out.stem}_maps")
