@@ -44,7 +44,7 @@ def test_a_task_of_a_maze_winds_and_its_path_is_the_shortest(tmp_path: Path) -> 
     for task in suite.tasks:
         occupancy_map = load_map(task.map_file)
         free = traversable(occupancy_map.occupied, 0.05, 0.1)
-        # From the other end: a path is as long there as back, up to the straight pieces at the ends.
+        # From the other end: as long there as back, up to the straight pieces at the ends.
         field = goal_distance(free, 0.05, np.array(task.start))
         row, column = points_to_cells(task.goal, 0.05)
         assert task.shortest_path == pytest.approx(field[row, column], rel=0.01)
