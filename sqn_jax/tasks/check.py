@@ -69,28 +69,42 @@ def first_unsolvable(
         robot_radius: m.
     """
     resolution = occupancy_map.resolution
-    free = traversable(occupancy_map.occupied, resolution, robot_radius)
-    labels, _ = connected_components(free)
-    where: dict[str, NDArray[np.int32]] = {}
-    for name, points in (("start", starts), ("goal", goals)):
-        cells = points_to_cells(occupancy_map.to_grid_frame(points), resolution)
-        inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < occupancy_map.shape), axis=-1)
-        row, col = np.where(inside[:, None], cells, 0).T
-        where[name] = np.where(inside, labels[row, col], -1)
-        for index in np.flatnonzero(where[name] <= 0)[:1]:
-            if not inside[index]:
+    labels, _ = connected_components(traversable(occupancy_map.occupied, resolution, robot_radius))
+    region_of_start, region_of_goal = (
+        _regions(occupancy_map, labels, points) for points in (starts, goals)
+    )
+    wrong = (region_of_start <= 0) | (region_of_goal <= 0) | (region_of_start != region_of_goal)
+    if not wrong.any():
+        return None
+    index = int(wrong.argmax())
+    on_map = f"on map {occupancy_map.name}"
+    for name, points, regions in (
+        ("start", starts, region_of_start),
+        ("goal", goals, region_of_goal),
+    ):
+        if regions[index] <= 0:
+            row, col = points_to_cells(occupancy_map.to_grid_frame(points[index]), resolution)
+            if regions[index] < 0:
                 what = "lies outside"
-            elif occupancy_map.occupied[row[index], col[index]]:
+            elif occupancy_map.occupied[row, col]:
                 what = "lies in an obstacle"
             else:
                 what = "is too near an obstacle"
             x, y = points[index]
             need = f"expected free space for a robot of radius {robot_radius:g} m"
-            return int(index), f"{name} ({x:g}, {y:g}) {what} on map {occupancy_map.name}, {need}"
-    for index in np.flatnonzero(where["start"] != where["goal"])[:1]:
-        (x, y), (goal_x, goal_y) = starts[index], goals[index]
-        return int(index), (
-            f"goal ({goal_x:g}, {goal_y:g}) cannot be reached from ({x:g}, {y:g}) on map "
-            f"{occupancy_map.name} by a robot of radius {robot_radius:g} m"
-        )
-    return None
+            return index, f"{name} ({x:g}, {y:g}) {what} {on_map}, {need}"
+    (x, y), (goal_x, goal_y) = starts[index], goals[index]
+    return index, (
+        f"goal ({goal_x:g}, {goal_y:g}) cannot be reached from ({x:g}, {y:g}) {on_map} by a robot "
+        f"of radius {robot_radius:g} m"
+    )
+
+
+def _regions(
+    occupancy_map: OccupancyMap, labels: NDArray[np.int32], points: NDArray[np.float64]
+) -> NDArray[np.int32]:
+    """Label of the region [E] of points [E, 2] in the map's frame: 0 in none, -1 off the map."""
+    cells = points_to_cells(occupancy_map.to_grid_frame(points), occupancy_map.resolution)
+    inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < labels.shape), axis=-1)
+    row, col = np.where(inside[:, None], cells, 0).T
+    return np.where(inside, labels[row, col], np.int32(-1))
