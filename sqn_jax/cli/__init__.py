@@ -1,4 +1,5 @@
-"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`.
+"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`,
+`sqn tasks`.
 
 It only passes arguments to functions.
 
@@ -22,6 +23,7 @@ from sqn_jax import __version__
 from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
+from sqn_jax.cli.tasks import tasks
 from sqn_jax.cli.train import train
 from sqn_jax.outside.messages import say, say_lines
 from sqn_jax.runs import streams
@@ -33,6 +35,7 @@ _SUMMARIES = {
     "report RUN ...": "the same as a page with pictures, the worst episodes first",
     "render RUN ...": "animations and pictures of what trained robots do on a map",
     "map check FILE": "describe a map, or say what is wrong with it",
+    "tasks ACTION": "make or check a suite of tasks, on public benchmarks or fresh maps",
 }
 
 
@@ -127,4 +130,5 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "report": report,
     "render": render,
     "map": check_map,
+    "tasks": tasks,
 }

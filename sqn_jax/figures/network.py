@@ -179,7 +179,8 @@ def _draw_arrow(axes: Axes, *points: tuple[float, float]) -> None:
 
 
 def _draw_note(axes: Axes, x: float, y: float, note: str, **options: Any) -> None:
-    axes.text(x, y, note, **{"fontsize": 9, "color": INK, "ha": "center", "va": "center"} | options)
+    style: dict[str, Any] = {"fontsize": 9, "color": INK, "ha": "center", "va": "center"}
+    axes.text(x, y, note, **style | options)
 
 
 def _draw_perception(axes: Axes, modules: Tree, middle: float) -> _Box:
