@@ -19,7 +19,7 @@ def evaluate_session(
     agents: Sequence[Agent],
     settings: Settings,
     out: Path | None = None,
-    on_evaluated: OnEvaluated = lambda batch: None,
+    on_evaluated: OnEvaluated | None = None,
     fields: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Evaluate agents with a progress bar.
