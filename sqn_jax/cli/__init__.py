@@ -1,4 +1,5 @@
-"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`.
+"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`,
+`sqn tasks`.
 
 It only passes arguments to functions.
 
@@ -19,6 +20,7 @@ from typing import NoReturn
 from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
+from sqn_jax.cli.tasks import tasks
 from sqn_jax.cli.train import train
 from sqn_jax.runs.signals import Interrupted, end_at_once
 
@@ -29,6 +31,7 @@ USAGE = """usage: sqn COMMAND [OPTIONS]
   sqn report RUN ...     the same as a page with pictures, the worst episodes first
   sqn render RUN ...     animations and pictures of what trained robots do on a map
   sqn map check FILE     describe a map, or say what is wrong with it
+  sqn tasks ACTION       make or check a suite of tasks, on public benchmarks or fresh maps
 
 `sqn COMMAND --help` lists the options of a command.
 """
@@ -116,4 +119,5 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "report": report,
     "render": render,
     "map": check_map,
+    "tasks": tasks,
 }
