@@ -47,15 +47,16 @@ def join_maps(
         body=_join([world.body for world in worlds]),
         lattice=Lattice.over(tile_m[1], tile_m[0], config.coverage_cell, config.max_range),
         max_steps=max_steps,
-        **{name: _one_entry(getattr(first, name)) for name in _SPAWN},
+        spawn_positions=_one_entry(first.spawn_positions),
+        spawn_counts=_one_entry(first.spawn_counts),
+        start_points=_one_entry(first.start_points),
+        spawn_groups=_one_entry(first.spawn_groups),
+        spawn_neighbors=_one_entry(first.spawn_neighbors),
     )
 
 
-_SPAWN = ("spawn_positions", "spawn_counts", "start_points", "spawn_groups", "spawn_neighbors")
-"""What tasks are drawn from; its shapes differ from map to map."""
-
-
 def _one_entry(array: Array) -> Array:
+    """What tasks are drawn from differs in shape from map to map, and is not used."""
     return array[(slice(0, 1),) * array.ndim]
 
 

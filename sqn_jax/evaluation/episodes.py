@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.agent.trajectory import Trajectory, over_robots
-from sqn_jax.env import EnvParams, reset_to
+from sqn_jax.env import EnvParams, EnvState, Observation, reset_to
 from sqn_jax.env.randomize import robot_axes
 from sqn_jax.env.several_maps import select_maps
 from sqn_jax.training.rollout import (
@@ -82,7 +82,9 @@ def start_episodes(
         draws = random_draws(draws_key, env_params.max_steps, 1)
         return jax.random.split(start_key, 1)[0], jax.tree.map(lambda x: x[:, 0], draws)
 
-    def begin(key: Array, start: Array, goal: Array, world: EnvParams) -> Any:
+    def begin(
+        key: Array, start: Array, goal: Array, world: EnvParams
+    ) -> tuple[Observation, EnvState]:
         heading_key, noise_key = jax.random.split(key)
         drawn = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
         heading = jnp.where(jnp.isnan(start[2]), drawn, start[2])
@@ -92,8 +94,8 @@ def start_episodes(
     if tasks is None:
         return draws, ActorState(*reset_robots(start_keys, env_params), carry)
     begin_all = jax.vmap(begin, in_axes=(0, 0, 0, robot_axes(env_params)))
-    first = begin_all(start_keys, tasks.starts, tasks.goals, env_params)
-    return draws, ActorState(*first, carry)
+    obs, env_state = begin_all(start_keys, tasks.starts, tasks.goals, env_params)
+    return draws, ActorState(obs, env_state, carry)
 
 
 class EpisodeResults(NamedTuple):
@@ -154,9 +156,9 @@ def run_seeds(
         of_batch = None if tasks is None else jax.tree.map(lambda x, i=chosen: x[i], tasks)
         trajectory = _run_batch(keys[chosen], params, env_params, network, epsilon, of_batch)
         if of_batch is None:
-            metrics = [_metrics(_judged(trajectory), jnp.float32(radius)) for radius in radii]
+            metrics = [_metrics(judged(trajectory), jnp.float32(radius)) for radius in radii]
         else:
-            metrics = [_task_metrics(_judged(trajectory), of_batch, jnp.bool_(collision_ends))]
+            metrics = [task_metrics(judged(trajectory), of_batch, jnp.bool_(collision_ends))]
         ends = trajectory.poses[:, 0], trajectory.goals
         of_policies = jax.device_get((metrics, *ends, trajectory.only(*fields)))
         results = [
@@ -165,10 +167,12 @@ def run_seeds(
         ]
         batches.append([result.of_episodes(slice(count)) for result in results])
         on_batch(num_policies * count)
-    return [_join(results) for results in zip(*batches, strict=True)]
+    return [join_results(results) for results in zip(*batches, strict=True)]
 
 
-def _join(batches: Sequence[EpisodeResults]) -> EpisodeResults:
+def join_results(batches: Sequence[EpisodeResults]) -> EpisodeResults:
+    """The results of several batches of episodes of one policy, in their order."""
+
     def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
         return np.concatenate(parts, axis)
 
@@ -232,13 +236,13 @@ def _run_batch(
 
 def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
     """`episode_metrics` of one policy for each radius, m; NumPy arrays [E]."""
-    stacked = jax.tree.map(lambda x: x[None], _judged(trajectory))
+    stacked = jax.tree.map(lambda x: x[None], judged(trajectory))
     metrics = jax.device_get([_metrics(stacked, jnp.float32(radius)) for radius in goal_radii])
     on_host: list[EpisodeMetrics] = jax.tree.map(lambda x: x[0], metrics)
     return on_host
 
 
-def _judged(trajectory: Trajectory) -> Trajectory:
+def judged(trajectory: Trajectory) -> Trajectory:
     """The part of a trajectory that decides the metrics."""
     return trajectory.only("rewards", "poses", "info")
 
@@ -248,7 +252,8 @@ _metrics = jax.jit(jax.vmap(episode_metrics, in_axes=(0, None)))
 
 
 @jax.jit
-def _task_metrics(trajectory: Trajectory, tasks: GivenTasks, collision_ends: Array) -> Any:
+def task_metrics(trajectory: Trajectory, tasks: GivenTasks, collision_ends: Array) -> Any:
+    """The metrics [S, E] of given tasks, out of trajectories [S, T, E, ...]."""
     judge = jax.vmap(episode_metrics, in_axes=(0, None, None, None))
     return judge(trajectory, tasks.goal_radii, tasks.max_steps, collision_ends)
 

@@ -227,6 +227,7 @@ def episode_metrics(
     """
     info = trajectory.info
     length, num_robots = trajectory.rewards.shape
+    is_cut = max_steps is not None
     limit = jnp.full(num_robots, length) if max_steps is None else max_steps
     end = limit
     if collision_ends is not None:
@@ -245,7 +246,7 @@ def episode_metrics(
     return EpisodeMetrics(
         success=success,
         time_steps=time_steps,
-        mean_reward=jnp.where(within, trajectory.rewards, 0.0).sum(axis=0) / end,
+        mean_reward=jnp.mean(trajectory.rewards, axis=0, where=within if is_cut else None),
         collisions=(info["collision"] & within).sum(axis=0, dtype=jnp.int32),
         covered_area=jnp.where(within, info["covered_area"], 0.0).sum(axis=0),
         path_length=jnp.where(counted, traveled, 0.0).sum(axis=0),
