@@ -27,7 +27,7 @@ from sqn_jax.maps.occupancy import (
     points_to_cells,
     traversable,
 )
-from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_TASKS, Task, TaskSuite
+from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_TASKS, Task
 
 FIRST_SEED = 1000
 """Maps of smaller seeds are those that policies are trained on and that pictures show."""
