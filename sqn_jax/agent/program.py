@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 from sqn_jax.agent.networks import QNetwork, make_network
 from sqn_jax.agent.shards import AXIS
 from sqn_jax.config import LearnerConfig, TrainConfig
+from sqn_jax.config.validation import require
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,8 @@ class Program:
     follow from the fields, are made once and not compared.
 
     Raises:
-        ValueError: the window does not divide the episode.
+        ValueError: the window does not divide the episode, or burn-in leaves nothing of it; or the
+            updates of the run cannot be counted.
     """
 
     config: TrainConfig
@@ -33,11 +35,30 @@ class Program:
     """The devices that the robots are divided between; None for one alone."""
 
     def __post_init__(self) -> None:
-        if self.max_steps % self.window_length:
-            raise ValueError(
-                f"learner.window_length is {self.window_length}, expected a divisor of the "
-                f"episode's {self.max_steps} steps"
-            )
+        learner, steps = self.config.learner, f"the episode's {self.max_steps} steps"
+        if self.config.env.max_steps == 0:
+            steps += " (env.max_steps 0: the limit of the map)"
+        require(
+            self.max_steps % self.window_length == 0,
+            "learner.window_length",
+            learner.window_length,
+            f"a divisor of {steps}",
+        )
+        require(
+            self.config.method != "r2d2" or learner.burn_in_length < self.max_steps,
+            "learner.burn_in_length",
+            learner.burn_in_length,
+            f"less than {steps}",
+        )
+        require(
+            learner.discount_start < 1, "learner.discount_start", learner.discount_start, "below 1"
+        )
+        require(
+            self.total_updates < 2**31,
+            "total_episodes",
+            self.config.total_episodes,
+            f"fewer than 2147483648 updates, at {self.updates_per_round:,} a round",
+        )
 
     @cached_property
     def network(self) -> QNetwork:

@@ -4,51 +4,47 @@
 It only passes arguments to functions.
 
 Exit codes: 0 success, 1 failure, 2 wrong arguments or unusable input (one line, no traceback); 130,
-143 and 129 in a shell: stopped by SIGINT, SIGTERM or SIGHUP. If there is something to save, it is
-saved first. If not, the signal itself ends the process at once; Python's `subprocess` reports this
-as -2, -15 and -1.
+143, 129 and 141 in a shell: stopped by SIGINT, SIGTERM, SIGHUP or a reader that left. If there is
+something to save, it is saved first. If not, the signal itself ends the process at once; Python's
+`subprocess` reports this as -2, -15 and -1.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
+from sqn_jax import __version__
 from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
 from sqn_jax.cli.tasks import tasks
 from sqn_jax.cli.train import train
+from sqn_jax.runs import streams
 from sqn_jax.runs.signals import Interrupted, end_at_once
 
-USAGE = """usage: sqn COMMAND [OPTIONS]
-
-  sqn train              train a robot, evaluate it, and draw what it did
-  sqn evaluate RUN ...   compare trained robots and baselines on any maps, with noise
-  sqn report RUN ...     the same as a page with pictures, the worst episodes first
-  sqn render RUN ...     animations and pictures of what trained robots do on a map
-  sqn map check FILE     describe a map, or say what is wrong with it
-  sqn tasks ACTION       make or check a suite of tasks, on public benchmarks or fresh maps
-
-`sqn COMMAND --help` lists the options of a command.
-"""
+_SUMMARIES = {
+    "train": "train a robot, evaluate it, and draw what it did",
+    "evaluate RUN ...": "compare trained robots and baselines on any maps, with noise",
+    "report RUN ...": "the same as a page with pictures, the worst episodes first",
+    "render RUN ...": "animations and pictures of what trained robots do on a map",
+    "map check FILE": "describe a map, or say what is wrong with it",
+    "tasks ACTION": "make or check a suite of tasks, on public benchmarks or fresh maps",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     try:
-        code = _dispatch(list(sys.argv[1:] if arguments is None else arguments))
-        _flush()
+        return _dispatch(list(sys.argv[1:] if arguments is None else arguments))
     except Interrupted as stop:
         print(f"\nsqn: {stop}", file=sys.stderr)
-        code = stop.exit_code
-    except BrokenPipeError:  # The reader, say `head`, has closed the pipe.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 1
-    return code
+        return stop.exit_code
 
 
 def run() -> NoReturn:
@@ -58,23 +54,23 @@ def run() -> NoReturn:
     running, and would crash or print errors while Python shuts down.
     """
     end_at_once()
+    streams.install()
     code = main()
+    failure = streams.failure()
+    if failure is not None and code == 0:
+        code = _fail(failure) if failure else 1
     if code == 1 or code > 128:
-        _flush()
-        sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
 
 
-def _flush() -> None:
-    if sys.stdout is not None:  # It is None where a process is started without one.
-        sys.stdout.flush()
-
-
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE, end="")
+        print(_usage())
         return 0 if arguments else 2
+    if arguments[0] == "--version":
+        print(f"sqn {__version__}")
+        return 0
     name, *command_arguments = arguments
     command = _COMMANDS.get(name)
     if command is None:
@@ -85,8 +81,6 @@ def _dispatch(arguments: list[str]) -> int:
             return command(command_arguments)
     except SystemExit as stop:  # After a help text.
         return int(stop.code or 0)
-    except BrokenPipeError:
-        raise
     except OSError as error:  # A full disk, say.
         has_file = error.filename and error.strerror
         return _fail(f"{error.filename}: {error.strerror}" if has_file else str(error))
@@ -97,6 +91,22 @@ def _dispatch(arguments: list[str]) -> int:
         return code
     except FloatingPointError as error:  # The run has diverged.
         return _fail(str(error))
+
+
+def _usage() -> str:
+    """The commands, in lines that fit the terminal."""
+    width = shutil.get_terminal_size().columns
+    ends = (
+        "`sqn COMMAND --help` lists the options of a command, `sqn --version` prints the version."
+    )
+    indent = " " * 25
+    commands = [
+        textwrap.fill(f"{'  sqn ' + name:25}{summary}", width, subsequent_indent=indent)
+        for name, summary in _SUMMARIES.items()
+    ]
+    return "\n".join(
+        ["usage: sqn COMMAND [OPTIONS]", "", *commands, "", textwrap.fill(ends, width)]
+    )
 
 
 def _refuse(message: str) -> int:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 from sqn_jax.config.map_names import parse
 
@@ -20,12 +21,19 @@ CACHE = (
 )
 
 
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?|\.[0-9]+(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)"
+
+
 class Parser(argparse.ArgumentParser):
     """Reports errors as a ValueError, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
         """Raise the message that argparse would print."""
         raise ValueError(message)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # Not that of argparse, which says nothing of a disk that is full.
+        print(message, end="", file=file)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +54,25 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_params(parser: argparse.ArgumentParser) -> None:
+    """Add the option --params."""
+    parser.add_argument(
+        "--params",
+        choices=["shipped", "latest", "average", "target"],
+        default="shipped",
+        help="which parameters of a run act: those it ships (default: the average where it keeps "
+        "one), the latest, the average, or those of the target network",
+    )
+
+
+def tasks(argument: str) -> str:
+    """Tasks to evaluate on: points, pairs, or a file."""
+    if argument in TASKS or argument.endswith(".json"):
+        return argument
+    known = ", ".join(TASKS)
+    raise argparse.ArgumentTypeError(f"is {argument!r}, expected {known} or a file ending in .json")
+
+
 def checkpoint(argument: str) -> int | str:
     """A checkpoint of a run: newest, best, or its number of chunks."""
     if argument in ("newest", "best"):
@@ -55,10 +82,26 @@ def checkpoint(argument: str) -> int | str:
     raise argparse.ArgumentTypeError(f"is {argument}, expected newest, best or a number")
 
 
+def integer(argument: str) -> int:
+    """A whole number in plain digits; Python would also take `1_000`, and digits of any script."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,30}", argument):
+        raise argparse.ArgumentTypeError(f"is {argument!r}, expected an integer")
+    return int(argument)
+
+
+def number(argument: str) -> float:
+    """A number in plain digits; whether it may be infinite or none is for others to say."""
+    if not re.fullmatch(_NUMBER, argument, re.IGNORECASE):
+        raise argparse.ArgumentTypeError(f"is {argument!r}, expected a number")
+    return float(argument)
+
+
 def folder(argument: str) -> Path:
     """The path of a folder."""
     if not argument.strip():
         raise argparse.ArgumentTypeError("is empty, expected the name of a folder")
+    if any("\ud800" <= sign <= "\udfff" for sign in argument):
+        raise argparse.ArgumentTypeError(f"is {argument!a}, expected a name in UTF-8")
     return Path(argument)
 
 

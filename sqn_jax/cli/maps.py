@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from sqn_jax.cli.arguments import Parser
+from sqn_jax.cli.arguments import Parser, number
 from sqn_jax.config.map_names import parse
+from sqn_jax.config.validation import LIMITS, require_limits
 
 
 def check_map(arguments: list[str]) -> int:
@@ -11,13 +12,14 @@ def check_map(arguments: list[str]) -> int:
     parser = Parser(prog="sqn map", description="Check maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
     parser.add_argument("file", help="a file, a map of the project by name, or maze:7, maze:0-3")
-    parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
+    parser.add_argument("--robot-radius", type=number, default=0.1, help="m (default 0.1)")
     parser.add_argument(
         "--allow-outside",
         action="store_true",
         help="let the YAML file name an image that lies outside its folder",
     )
     options = parser.parse_args(arguments)
+    require_limits(options.robot_radius, "--robot-radius", *LIMITS["env.robot_radius"])
     from sqn_jax.maps import load_map
     from sqn_jax.maps.check import describe
 

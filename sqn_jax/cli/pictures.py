@@ -11,6 +11,8 @@ from sqn_jax.cli.arguments import (
     add_checkpoint,
     add_device,
     folder,
+    integer,
+    number,
     single_maps,
 )
 
@@ -27,10 +29,17 @@ def report(arguments: list[str]) -> int:
     add = parser.add_argument
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--maps", nargs="+", help="names or files (default: the map of the first run)")
-    add("--tasks", nargs="+", choices=list(TASKS), default=["points"], help="default: points")
-    add("--episodes", type=int, default=100, help="per evaluation seed (default 100)")
-    add("--eval-seeds", type=int, default=1, help="number of evaluation seeds (default 1)")
-    add("--seed", type=int, default=1_000, help="the first evaluation seed (default 1000)")
+    add(
+        "--tasks",
+        nargs="+",
+        choices=list(TASKS),
+        default=["points"],
+        metavar="TASKS",
+        help="points, pairs or both (default: points)",
+    )
+    add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
+    add("--eval-seeds", type=integer, default=1, help="number of evaluation seeds (default 1)")
+    add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
     add_device(parser)
@@ -77,13 +86,13 @@ def render(arguments: list[str]) -> int:
     add = parser.add_argument
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
     add("--map", default="maze", help="a name or a file (default maze)")
-    add("--episodes", type=int, default=4, help="per policy (default 4)")
+    add("--episodes", type=integer, default=4, help="per policy (default 4)")
     add("--tasks", choices=list(TASKS), default="points", help="default: points")
-    add("--animations", type=int, default=1, help="animations per policy (default 1)")
-    add("--seed", type=int, default=1_000, help="the evaluation seed (default 1000)")
-    add("--velocity-noise", type=float, default=0.0, metavar="S", help="e.g. 0.1")
-    add("--range-noise", type=float, default=0.0, metavar="P", help="e.g. 0.2")
-    add("--max-steps", type=int, default=0, help="steps per episode (default: the map's limit)")
+    add("--animations", type=integer, default=1, help="animations per policy (default 1)")
+    add("--seed", type=integer, default=1_000, help="the evaluation seed (default 1000)")
+    add("--velocity-noise", type=number, default=0.0, metavar="S", help="e.g. 0.1")
+    add("--range-noise", type=number, default=0.0, metavar="P", help="e.g. 0.2")
+    add("--max-steps", type=integer, default=0, help="steps per episode (default: the map's limit)")
     add("--mp4", action="store_true", help="also write MP4 files; needs sqn_jax[video]")
     add_checkpoint(parser)
     add_device(parser)

@@ -13,9 +13,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 from sqn_jax import config as configs
+from sqn_jax.cli.arguments import integer, number
 from sqn_jax.config import TrainConfig
 
 METAVARS = {int: "INT", float: "FLOAT", str: "TEXT"}
+TYPES: dict[type, Callable[[str], Any]] = {int: integer, float: number, str: str}
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +118,7 @@ def _add_fields(
         if name in leave_out:
             continue
         options, default = [option(f"{prefix}{name}")], "%(default)s"
-        keywords: dict[str, Any] = {"type": hint, "metavar": METAVARS.get(hint)}
+        keywords: dict[str, Any] = {"type": TYPES.get(hint), "metavar": METAVARS.get(hint)}
         if hint is bool:
             options.append(option(f"{prefix}{name}", False))
             keywords = {"action": _Switch, "nargs": 0}

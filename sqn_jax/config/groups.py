@@ -11,6 +11,7 @@ from sqn_jax.config.validation import (
     require_known_choices,
     require_not_negative,
     require_positive,
+    require_within_limits,
 )
 
 
@@ -92,6 +93,7 @@ class EnvConfig:
             "a positive multiple of 4",
         )
         require(self.ray_iterations >= 1, "env.ray_iterations", self.ray_iterations, "at least 1")
+        require_within_limits(self, "env")
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class RandomizationConfig:
         for name in ("velocity_noise", "range_noise"):
             require_not_negative(self, "randomization", name)
         require(0 <= self.speed <= 1, "randomization.speed", self.speed, "a number from 0 to 1")
+        require_within_limits(self, "randomization")
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,7 @@ class NetworkConfig:
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):
             value = getattr(self, name)
             require(value >= 1, f"network.{name}", value, "at least 1")
+        require_within_limits(self, "network")
 
 
 @dataclass(frozen=True)
@@ -163,6 +167,7 @@ class ReplayConfig:
         for name in ("priority_exponent", "importance_exponent", "max_priority_weight"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"replay.{name}", value, "a number from 0 to 1")
+        require_within_limits(self, "replay")
 
 
 @dataclass(frozen=True)
@@ -222,6 +227,7 @@ class LearnerConfig:
             require(0 <= value <= 1, f"learner.{name}", value, "a number from 0 to 1")
         value = self.target_update_rate
         require(0 < value <= 1, "learner.target_update_rate", value, "more than 0, at most 1")
+        require_within_limits(self, "learner")
 
 
 @dataclass(frozen=True)
@@ -243,6 +249,7 @@ class ExplorationConfig:
             require(0 <= value <= 1, f"exploration.{name}", value, "a number from 0 to 1")
         value = self.decay_fraction
         require(0 < value <= 1, "exploration.decay_fraction", value, "more than 0, at most 1")
+        require_within_limits(self, "exploration")
 
 
 @dataclass(frozen=True)
@@ -255,5 +262,4 @@ class EvalConfig:
     """Seed of the starts and goals; independent of the training seed."""
 
     def __post_init__(self) -> None:
-        require(self.episodes >= 1, "eval.episodes", self.episodes, "at least 1")
-        require(self.seed >= 0, "eval.seed", self.seed, "0 or a positive number")
+        require_within_limits(self, "eval")

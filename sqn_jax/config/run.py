@@ -18,10 +18,12 @@ from sqn_jax.config.groups import (
 )
 from sqn_jax.config.map_names import MapSet, parse
 from sqn_jax.config.validation import (
+    MOST,
     require,
     require_known_choices,
     require_not_negative,
     require_positive,
+    require_within_limits,
 )
 
 Algorithm = Literal["sqn", "r2d2", "dqn"]
@@ -83,8 +85,19 @@ class TrainConfig:
             self.total_episodes,
             f"at least num_envs ({self.num_envs}), one round",
         )
-        most = 10**9
-        require(self.total_episodes <= most, "total_episodes", self.total_episodes, f"up to {most}")
+        require_within_limits(self, "")
+        require(
+            self.seed + self.num_seeds <= 2**31,
+            "num_seeds",
+            self.num_seeds,
+            f"at most {2**31 - self.seed} from seed {self.seed} on",
+        )
+        require(
+            self.num_rounds * self.num_envs <= MOST,
+            "rounds_per_chunk",
+            self.rounds_per_chunk,
+            f"a run of at most {MOST:,} episodes, in full chunks of {self.num_envs} a round",
+        )
         require_positive(self, "", "checkpoint_minutes")
         require_not_negative(self, "", "max_skipped_updates")
         if self.method == "r2d2":

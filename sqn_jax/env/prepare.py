@@ -13,7 +13,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env.arithmetic import LARGEST_INTEGER
+from sqn_jax.env.arithmetic import LARGEST_INTEGER, require_single_precision
 from sqn_jax.env.coverage import Lattice
 from sqn_jax.env.free_space import far_sides, free_rectangles
 from sqn_jax.env.params import EnvParams
@@ -61,13 +61,15 @@ def make_env(
         The parameters that `reset` and `step` take.
 
     Raises:
-        ValueError: the map is unusable; the message names the file and what was expected.
+        ValueError: the map is unusable; the message names the file and what was expected. Or JAX
+            is set to double precision.
 
     Example:
         >>> params = make_env("maze")
         >>> params.max_steps
         400
     """
+    require_single_precision()
     config = EnvConfig() if config is None else config
     if spawn not in ("training", "evaluation"):
         raise ValueError(f"spawn is {spawn!r}, expected training or evaluation")
@@ -136,6 +138,13 @@ def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
             f"map {name}: {width_m:,.0f} x {height_m:,.0f} m with env.coverage_cell "
             f"{config.coverage_cell:g} m are {points:,.0f} points to count the covered area on, "
             f"expected at most {MAX_LATTICE_POINTS:,}: a smaller map or a larger env.coverage_cell"
+        )
+    lattice = Lattice.over(height_m, width_m, config.coverage_cell, config.max_range)
+    if 32 * math.prod(lattice.shape) > 8 * MAX_LATTICE_POINTS:
+        raise ValueError(
+            f"env.max_range is {config.max_range:g} m with env.coverage_cell "
+            f"{config.coverage_cell:g} m, expected at most that of the map {name}, "
+            f"{math.hypot(width_m, height_m):,.0f} m"
         )
     reach = occupancy_map.spawn_radius / occupancy_map.resolution + 1
     places = len(occupancy_map.spawn_points) * min(math.pi * reach**2, height * width)

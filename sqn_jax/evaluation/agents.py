@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.config.validation import require_limits
 from sqn_jax.evaluation import baseline_episodes, episodes
 from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.settings import Settings, World, task_key
@@ -254,6 +255,24 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
             raise ValueError(f"runs {folders}: the same settings and the same training seed twice")
         agents.append(agent)
     return agents
+
+
+def with_epsilons(agents: Sequence[TrainedAgent], epsilons: Sequence[float]) -> list[TrainedAgent]:
+    """Each agent once for each probability of a random action; named by it, if it is more than 0.
+
+    Raises:
+        ValueError: a probability is not in 0..1, or comes twice.
+    """
+    for epsilon in epsilons:
+        require_limits(epsilon, "epsilon", 0, 1)
+        if epsilons.count(epsilon) > 1:
+            raise ValueError(f"epsilon: {epsilon} comes twice, expected each once")
+
+    def named(agent: TrainedAgent, epsilon: float) -> TrainedAgent:
+        name = f"{agent.name}, epsilon {epsilon:g}" if epsilon > 0 else agent.name
+        return dataclasses.replace(agent, name=name, epsilon=epsilon)
+
+    return [named(agent, epsilon) for agent in agents for epsilon in epsilons]
 
 
 def with_baselines(agents: Sequence[Agent], *, baselines: bool) -> list[Agent]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.evaluation import scores
-from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch
+from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import load_map
 
@@ -32,6 +32,33 @@ def num_episodes(agents: Sequence[Agent], settings: Settings) -> int:
     num_worlds = len(settings.maps) * len(settings.tasks) * len(settings.noise)
     num_policies = sum(len(agent.training_seeds) for agent in agents)
     return num_worlds * num_policies * settings.eval_seeds * settings.episodes
+
+
+RECORD_BYTES = 1_000
+"""What the record of an episode takes until it is written."""
+
+
+def memory_bytes(
+    agents: Sequence[Agent], maps: Maps, settings: Settings, fields: Sequence[str] = ()
+) -> float:
+    """About what `evaluate_agents` takes at most, with steps that are given on as `fields`.
+
+    A batch of an evaluation seed is there twice while its parts are joined; with `fields` those of
+    all worlds are assumed to stay.
+    """
+    steps = settings.max_steps or max(world.max_steps for world in maps.values())
+    numbers = 3 + 7 * ("info" in fields)  # Of a step, with the pose.
+    if "output" in fields:
+        numbers += 5 + 6 * max(_num_skills(agent) for agent in agents)
+    batches = 2 + (len(settings.tasks) * len(maps) * settings.eval_seeds if fields else 0)
+    records = num_episodes(agents, settings) * len(settings.goal_radii)
+    held = min(settings.episodes * settings.eval_seeds, max(EPISODES_AT_ONCE, settings.episodes))
+    joined = 2 * held + (batches - 2) * settings.episodes
+    return RECORD_BYTES * records + 4.0 * numbers * steps * joined
+
+
+def _num_skills(agent: Agent) -> int:
+    return agent.network.config.num_skills if isinstance(agent, TrainedAgent) else 1
 
 
 def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:

@@ -10,6 +10,7 @@ from typing import Literal
 import jax
 
 from sqn_jax.config import EnvConfig
+from sqn_jax.config.validation import LIMITS, require_limits
 from sqn_jax.env import EnvParams, make_env
 from sqn_jax.env.prepare import with_noise
 from sqn_jax.maps import OccupancyMap
@@ -20,9 +21,6 @@ SPAWN_MODES: dict[Tasks, Literal["evaluation", "training"]] = {
     "random pairs": "training",
 }
 """The two kinds of tasks, and the spawn mode of each."""
-
-MOST_EPISODES, MOST_STEPS = 100_000, 100_000
-"""Limits of episodes per evaluation seed and steps per episode; more would not fit into memory."""
 
 Maps = Mapping[tuple[str, float], OccupancyMap]
 """Maps by their name in the settings and the robot radius, m, for which they were loaded."""
@@ -56,24 +54,16 @@ class Settings:
         return [self.seed + index for index in range(self.eval_seeds)]
 
     def __post_init__(self) -> None:
-        for name, limit in (("episodes", MOST_EPISODES), ("eval_seeds", 10_000)):
-            if not 1 <= getattr(self, name) <= limit:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, expected at least 1 and at most {limit:,}"
-                )
-        if not 0 <= self.max_steps <= MOST_STEPS:
-            raise ValueError(f"max_steps is {self.max_steps}, expected 0 to {MOST_STEPS:,}")
-        if not 0 <= self.seed <= 2**31 - self.eval_seeds:
-            raise ValueError(
-                f"seed is {self.seed}, expected 0 to {2**31 - self.eval_seeds} for "
-                f"{self.eval_seeds} evaluation seeds"
-            )
-        for level in (level for pair in self.noise for level in pair):
-            if not 0 <= level <= 1e6:
-                raise ValueError(f"noise is {level}, expected 0 to 1000000")
+        require_limits(self.episodes, "episodes", *LIMITS["eval.episodes"])
+        require_limits(self.eval_seeds, "eval_seeds", *LIMITS["eval.seeds"])
+        require_limits(self.max_steps, "max_steps", *LIMITS["env.max_steps"])
+        least, most = LIMITS["eval.seed"]
+        require_limits(self.seed, "seed", least, most + 1 - self.eval_seeds)
+        for velocity_noise, range_noise in self.noise:
+            require_limits(velocity_noise, "velocity noise", *LIMITS["env.velocity_noise"])
+            require_limits(range_noise, "range noise", *LIMITS["env.range_noise"])
         for radius in self.goal_radii:
-            if not 1e-6 <= radius <= 1e6:
-                raise ValueError(f"goal radius is {radius}, expected 0.000001 to 1000000 m")
+            require_limits(radius, "goal radius", *LIMITS["env.goal_radius"])
         for name in ("maps", "tasks", "noise", "goal_radii"):
             values = getattr(self, name)
             for value in values:

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+BLOCK = 2**20
+"""Values that a bootstrap draws at a time; each takes 16 bytes."""
+
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval for a success rate; valid at 0 and at 1 too.
@@ -33,6 +36,8 @@ def bootstrap_interval(
 ) -> tuple[float, float]:
     """Percentile bootstrap interval of the mean; the mean itself twice for a single value.
 
+    Draws some resamples at a time, of `BLOCK` values in all, and the same ones for any `BLOCK`.
+
     Raises:
         ValueError: no values.
     """
@@ -40,7 +45,13 @@ def bootstrap_interval(
     if array.size < 1:
         raise ValueError("an interval needs at least one value")
     rng = np.random.default_rng(seed)
-    means = array[rng.integers(array.size, size=(resamples, array.size))].mean(axis=1)
+    rows = max(1, BLOCK // array.size)
+    means = np.concatenate(
+        [
+            array[rng.integers(array.size, size=(min(rows, resamples - row), array.size))].mean(1)
+            for row in range(0, resamples, rows)
+        ]
+    )
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 

@@ -217,3 +217,17 @@ def suite_table(evaluation: dict[str, Any]) -> str:
             ]
         )
     return markdown_table(header, rows)
+
+
+def comparison_lines(evaluation: dict[str, Any]) -> Iterator[str]:
+    """For each two agents a line on which has more success on the same tasks."""
+    for comparison in evaluation["comparisons"]:
+        success = comparison["success"]
+        if success["p_value"] is None:
+            continue
+        low, high = success["ci95"]
+        yield (
+            f"{comparison['first']} less {comparison['second']}: success "
+            f"{success['difference']:+.2f}, 95 % interval {low:+.2f} to {high:+.2f}, "
+            f"p = {success['p_value']:.3g}"
+        )

@@ -7,7 +7,7 @@ program for all maps, and returns the contents of the evaluation file. It prints
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.config import EnvConfig
+from sqn_jax.config.validation import LIMITS, require_limits
 from sqn_jax.env import EnvParams, EnvState, Observation, make_env
 from sqn_jax.env.navigation import STAND
 from sqn_jax.env.prepare import with_noise
@@ -53,13 +54,12 @@ class SuiteSettings:
     """Velocity noise and range noise, in the units of each robot."""
 
     def __post_init__(self) -> None:
-        for name, limit in (("episodes", 10_000), ("eval_seeds", 10_000)):
-            if not 1 <= getattr(self, name) <= limit:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, expected at least 1 and at most {limit:,}"
-                )
-        if not 0 <= self.seed <= 2**31 - self.eval_seeds:
-            raise ValueError(f"seed is {self.seed}, expected 0 to {2**31 - self.eval_seeds}")
+        require_limits(self.episodes, "episodes", *LIMITS["eval.episodes"])
+        require_limits(self.eval_seeds, "eval_seeds", *LIMITS["eval.seeds"])
+        least, most = LIMITS["eval.seed"]
+        require_limits(self.seed, "seed", least, most + 1 - self.eval_seeds)
+        require_limits(self.noise[0], "velocity noise", *LIMITS["env.velocity_noise"])
+        require_limits(self.noise[1], "range noise", *LIMITS["env.range_noise"])
 
     @property
     def all_eval_seeds(self) -> list[int]:
@@ -123,7 +123,7 @@ def num_episodes(agents: Sequence[Agent], suite: TaskSuite, settings: SuiteSetti
 def evaluate_suite(
     agents: Sequence[Agent],
     suite: TaskSuite,
-    load: LoadMap,
+    maps: Mapping[float, LoadMap],
     settings: SuiteSettings,
     on_batch: OnBatch = lambda count: None,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -132,7 +132,7 @@ def evaluate_suite(
     Args:
         agents: the agents; their names must differ. A robot gets what the suite fixes.
         suite: the tasks, checked by `tasks.check_tasks`.
-        load: loads a map for the robot.
+        maps: for each radius of a robot, m, what makes the maps for it.
         settings: episodes, seeds and noise.
         on_batch: called with the number of episodes that have just been run.
 
@@ -142,9 +142,8 @@ def evaluate_suite(
     """
     tables = {agent.name: suite_scores.empty_table(agent, suite, settings) for agent in agents}
     robots = {agent.name: robot_for(agent.env_config, suite) for agent in agents}
-    maps = SuiteMaps(load)
     for robot in dict.fromkeys(robots.values()):
-        for chunk in chunks(suite, robot, maps, settings.noise):
+        for chunk in chunks(suite, robot, maps[robot.robot_radius], settings.noise):
             for agent in agents:
                 if robots[agent.name] == robot:
                     results = run_chunk(agent, chunk, settings, on_batch)

@@ -18,13 +18,14 @@ from sqn_jax.evaluation.agents import (
     group_policies,
     with_baselines,
 )
-from sqn_jax.evaluation.compare import evaluate_agents, load_maps, num_episodes
+from sqn_jax.evaluation.compare import evaluate_agents, load_maps, memory_bytes, num_episodes
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.pretrained import find_policy, names_a_run
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.episodes import WorstEpisode, worst_episodes
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.run_folder import RunFolder
+from sqn_jax.training import memory_budget
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,9 @@ def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) 
             raise ValueError(f"{count} runs are called {name!r}, expected different names")
     agents = with_baselines(trained, baselines=baselines)
     maps = load_maps(agents, settings)
+    fields = ("info", "output")
+    needed = memory_bytes(agents, maps, settings, fields)
+    memory_budget.require(needed, "keeping the episodes", "evaluate")
     batches: list[EpisodeBatch] = []
 
     def collect(batch: EpisodeBatch) -> None:
@@ -118,9 +122,7 @@ def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) 
             batches.append(batch)
 
     with episodes_bar(num_episodes(agents, settings)) as bar:
-        evaluation, _ = evaluate_agents(
-            agents, maps, settings, bar.update, collect, fields=("info", "output")
-        )
+        evaluation, _ = evaluate_agents(agents, maps, settings, bar.update, collect, fields)
     print("drawing the worst episodes ...", flush=True)
     return Content(list(runs), trained, settings, evaluation, batches, worst_episodes(batches))
 

@@ -8,6 +8,7 @@ import jax
 
 import sqn_jax
 from sqn_jax.agent.learner import policy_params
+from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.compare import evaluate_agents
@@ -15,8 +16,36 @@ from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
-from sqn_jax.training import devices
+from sqn_jax.training import devices, memory_budget
 from sqn_jax.training.state import RunnerState
+
+FIELDS = ("output",)
+"""What the figures need of the steps, beside the poses."""
+
+
+def settings_of(config: TrainConfig) -> Settings:
+    """The settings of the final evaluation of a run: its first map, both kinds of tasks."""
+    return Settings(
+        maps=(str(config.maps.names[0]),),
+        tasks=("evaluation points", "random pairs"),
+        episodes=config.eval.episodes,
+        eval_seeds=1,
+        seed=config.eval.seed,
+        noise=((config.env.velocity_noise, config.env.range_noise),),
+        goal_radii=(config.env.goal_radius,),
+        max_steps=config.env.max_steps,
+    )
+
+
+def require_memory(program: Program) -> None:
+    """Refuse a run whose final evaluation would not fit into memory; asked before it is trained."""
+    config = program.config
+    settings = settings_of(config)
+    numbers = 3 + 5 + 6 * config.network.num_skills
+    # The steps of both kinds of tasks, what is joined, and a copy for the figures.
+    copies = len(settings.tasks) + 2
+    needed = 4.0 * numbers * program.max_steps * settings.episodes * copies
+    memory_budget.require(needed, "the final evaluation", "final evaluation")
 
 
 def evaluate_run(
@@ -33,20 +62,9 @@ def evaluate_run(
     Returns:
         The results, and the episodes of the first seed for each kind of task.
     """
-    name = str(config.maps.names[0])
     # On one device; otherwise every program that uses them would run on all of the mesh.
     params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
     policy = Policy(folder.path.name, config, seeds_of(params, config))
-    settings = Settings(
-        maps=(name,),
-        tasks=("evaluation points", "random pairs"),
-        episodes=config.eval.episodes,
-        eval_seeds=1,
-        seed=config.eval.seed,
-        noise=((config.env.velocity_noise, config.env.range_noise),),
-        goal_radii=(config.env.goal_radius,),
-        max_steps=config.env.max_steps,
-    )
     of_first_seed: list[EpisodeBatch] = []
 
     def collect(batch: EpisodeBatch) -> None:
@@ -55,10 +73,10 @@ def evaluate_run(
 
     evaluation, records = evaluate_agents(
         [TrainedAgent(config.algo, (policy,))],
-        {(name, config.env.robot_radius): occupancy_map},
-        settings,
+        {(str(config.maps.names[0]), config.env.robot_radius): occupancy_map},
+        settings_of(config),
         on_evaluated=collect,
-        fields=("output",),
+        fields=FIELDS,
     )
     folder.write_json("evaluation.json", evaluation)
     folder.write_records("evaluation.jsonl", records)

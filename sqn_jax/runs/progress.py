@@ -1,4 +1,4 @@
-"""The progress bar of a command."""
+"""The progress of a command, on standard error."""
 
 from __future__ import annotations
 
@@ -13,9 +13,15 @@ def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
     return tqdm(
         total=total,
         initial=done,
-        mininterval=0.5 if sys.stderr.isatty() else 20,
+        mininterval=0.5 if sys.stderr is not None and sys.stderr.isatty() else 20,
         smoothing=0.1,
         dynamic_ncols=True,
+        disable=sys.stderr is None,  # A process may be started without one.
         bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
         "[{elapsed}, {remaining} left{postfix}]",
     )
+
+
+def phase(name: str) -> None:
+    """Say what a command does now, where it has no bar for it."""
+    print(f"{name} ...", file=sys.stderr, flush=True)

@@ -26,7 +26,7 @@ class Interrupted(KeyboardInterrupt):
 
     def __init__(self, number: int, resume_command: str = "") -> None:
         self.exit_code = 128 + number
-        """130, 143 or 129, as a shell reports a process that a signal has ended."""
+        """130, 143, 129 or 141, as a shell reports a process that a signal has ended."""
         advice = f", resume with {resume_command}" if resume_command else ""
         super().__init__(f"stopped by {signal.Signals(number).name} after saving{advice}")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import time
 import warnings
 from collections.abc import Callable
@@ -23,8 +24,8 @@ from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
-from sqn_jax.runs import divergence, final_evaluation
-from sqn_jax.runs.progress import episodes_bar
+from sqn_jax.runs import divergence, final_evaluation, streams
+from sqn_jax.runs.progress import episodes_bar, phase
 from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
 from sqn_jax.storage import manifest
@@ -84,6 +85,7 @@ def train_session(
     # Errors up to here leave no files behind.
     num_bytes = memory_bytes(env_params, program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
+    final_evaluation.require_memory(program)
     if tensorboard:
         require_tensorboard()
     is_saved = resume and bool(chunks_in(run_dir / CHECKPOINTS))
@@ -100,7 +102,9 @@ def train_session(
         training = _Training(env_params, program, folder, checkpoints, start, resume_command)
         runner = training.run(runner, None if board is None else board.scalars)
         first_map = _first_map(config, occupancy_map)
+        phase(f"evaluating on {first_map.name}")
         results, batches = final_evaluation.evaluate_run(runner, first_map, config, folder)
+        phase("drawing")
         has_figures = final_evaluation.draw_figures(batches, first_map, config, folder)
         if board is not None and has_figures:
             _add_figures(board, config, folder)
@@ -270,6 +274,8 @@ class _Training:
                 bar.set_postfix_str(_postfix(row), refresh=False)
                 bar.update(config.rounds_per_chunk * config.num_envs)
                 divergence.raise_if_diverged(row, runner.learner, config, self._folder)
+                if streams.reader_left():  # As a closed terminal would.
+                    received.append(signal.SIGPIPE)
                 is_due = time.monotonic() - self._saved_at > 60 * config.checkpoint_minutes
                 if received or is_due or report.chunk == config.num_chunks:
                     self._save(report.chunk, runner)

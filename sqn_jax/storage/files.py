@@ -43,8 +43,9 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
     """Write a JSON lines file as a whole or not at all; NaN becomes null."""
-    lines = [json.dumps(without_nan(record), allow_nan=False) + "\n" for record in records]
-    write_whole(path, "".join(lines))
+    with written_whole(path) as partial, partial.open("w", encoding="utf-8") as file:
+        for record in records:  # Of a large evaluation, more than should be in memory twice.
+            file.write(json.dumps(without_nan(record), allow_nan=False) + "\n")
 
 
 @contextmanager

@@ -33,8 +33,8 @@ def locked(run_dir: Path) -> Iterator[None]:
         _take(file, run_dir)
         left = os.read(file, 200).decode(errors="replace").strip()
         if left:
-            print(f"{left}, did not end in order; going on from what it saved", file=sys.stderr)
-        _note(file, f"process {os.getpid()} on {platform.node()}, here since {time.ctime()}")
+            print(f"{left}, did not end in order", file=sys.stderr)
+        _note(file, f"process {os.getpid()} on {platform.node()}, started {time.ctime()}")
         try:
             yield
         finally:

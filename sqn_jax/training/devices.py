@@ -53,12 +53,14 @@ def require(kind: str | None) -> None:
     Raises:
         ValueError: there is none of this kind, or none that JAX may use.
     """
+    _use_own_modes()
     if kind == "cpu":
         jax.config.update("jax_platforms", "cpu")
     try:
         backend = jax.devices()[0].platform
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
+    except Exception as error:  # JAX also fails by assertions, which say nothing.
+        chosen = f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}"
+        reason = " ".join(str(error).split())[:200] or chosen
         raise ValueError(f"JAX finds no device as it is set up here ({reason})") from None
     if kind is not None and backend != kind:
         raise ValueError(f"--device is {kind}, expected one that JAX finds here: {backend}")
@@ -68,6 +70,24 @@ def require(kind: str | None) -> None:
             "(pip install 'jax[cuda12]')",
             file=sys.stderr,
         )
+
+
+_MODES = {
+    "jax_enable_x64": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_disable_jit": False,
+}
+"""What all programs here expect: single precision, NaN for what is not known yet, compilation."""
+
+
+def _use_own_modes() -> None:
+    """Say and change what the environment has set for the programs of others."""
+    for name, expected in _MODES.items():
+        if (value := getattr(jax.config, name)) != expected:
+            jax.config.update(name, expected)
+            print(f"{name.upper()} is {value}, used is {expected}", file=sys.stderr)
 
 
 def _has_nvidia() -> bool:

@@ -12,8 +12,10 @@ import jax
 SETTINGS = {
     "r2d2": ("replay.capacity", "num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
     "pqn": ("num_envs", "learner.batch_size", "num_seeds", "env.max_steps"),
+    "evaluate": ("episodes", "eval_seeds", "max_steps"),
+    "final evaluation": ("eval.episodes", "env.max_steps"),
 }
-"""Settings that decide how much a run takes, the strongest first."""
+"""Settings that decide how much a run or an evaluation takes, the strongest first."""
 
 
 def require(num_bytes: float, what: str, method: str) -> None:
@@ -22,7 +24,7 @@ def require(num_bytes: float, what: str, method: str) -> None:
     Args:
         num_bytes: that will be allocated.
         what: what will be allocated for, "training" say.
-        method: of the run, whose settings are named.
+        method: of the run, or the kind of evaluation, whose settings are named.
 
     Raises:
         ValueError: it does not fit.

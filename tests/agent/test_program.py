@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -63,3 +64,35 @@ def test_windows_and_updates_by_hand() -> None:
 def test_a_window_that_does_not_divide_the_episode_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^learner.window_length is 30, expected a divisor .* 59"):
         Program(SMOKE, 59, NUM_ACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "max_steps", "message"),
+    [
+        ({}, 45, "learner.window_length is 30, expected a divisor of the episode's 45 steps"),
+        (
+            {"method": "r2d2"},
+            5,
+            "learner.burn_in_length is 5, expected less than the episode's 5 steps",
+        ),
+        (
+            {"total_episodes": 10**9, "learner": dataclasses.replace(SMOKE.learner, num_passes=9)},
+            60,
+            "total_episodes is 1000000000, expected fewer than 2147483648 updates, at 36 a round",
+        ),
+        (
+            {"learner": dataclasses.replace(SMOKE.learner, discount_start=1.0)},
+            60,
+            "learner.discount_start is 1.0, expected below 1",
+        ),
+    ],
+)
+def test_what_no_program_can_be_made_of_is_refused(
+    changes: dict[str, Any], max_steps: int, message: str
+) -> None:
+    config = dataclasses.replace(SMOKE, **changes)
+    with pytest.raises(ValueError, match="expected") as caught:
+        Program(config, max_steps, NUM_ACTIONS)
+    assert str(caught.value) == message
+    if config.method == "r2d2":  # One step is left to learn from.
+        assert Program(config, max_steps + 1, NUM_ACTIONS).num_windows == 1

@@ -57,7 +57,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return message
 
 
-@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("width", [60, 80, 120])
 def test_the_help_lists_every_option_with_its_description_and_the_default_of_the_preset(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: int
 ) -> None:
@@ -75,7 +75,7 @@ def test_the_help_lists_every_option_with_its_description_and_the_default_of_the
             shown = repr(defaults[name]) if LEAVES[name] is str else defaults[name]
             assert entry.endswith(f" (default: {shown})"), (option, entry)
             assert len(entry) > len(f"TEXT (default: {shown})") + 10, (option, entry)
-        assert "(paper sections III-A" in text
+        assert "(paper sections III-A" in " ".join(text.split())
 
 
 def test_every_setting_is_an_option_with_dashes_or_underscores(
@@ -119,10 +119,29 @@ def test_own_options_reach_the_run(
     assert main(["train", "--map", "x_y/my_map.yaml,maze:0-2", "--tensorboard"]) == 0
     config, run_dir, given = started.pop()
     assert config.map == "x_y/my_map.yaml,maze:0-2"
-    assert re.fullmatch(r"runs/[\d_-]+_sqn_my_map_maze_0-2_quick", str(run_dir))
+    assert re.fullmatch(r"runs/[\d_-]+_sqn_my_map_maze_0-2_quick_seed0", str(run_dir))
     assert given.tensorboard
     assert main(["train", "--preset", "best", "--seed=3", "--seed", "4"]) == 0
     assert started.pop()[0] == dataclasses.replace(PRESETS["best"], seed=4)
+
+
+def test_runs_that_start_in_one_second_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    new_folder = importlib.import_module("sqn_jax.cli.train")._new_folder
+    with new_folder(Path("runs/a")) as first:
+        pass
+    assert not Path("runs").exists()
+    with new_folder(Path("runs/a")) as first, new_folder(Path("runs/a")) as second:
+        (first / "config.json").touch()
+        with new_folder(Path("runs/a")) as third:
+            assert [str(path) for path in (first, second, third)] == [
+                "runs/a",
+                "runs/a_2",
+                "runs/a_3",
+            ]
+    assert [path.name for path in Path("runs").iterdir()] == ["a"]
 
 
 @pytest.mark.parametrize("value", ["-1", "-1e-3", "-.5"])
@@ -140,6 +159,14 @@ def test_a_negative_number_is_a_value(
         (["--n-step", "3"], ["did you mean --learner.n-step?"]),
         (["--total-episode", "3"], ["did you mean --total-episodes?"]),
         (["--see", "3"], ["unrecognized", "--see"]),
+        (["--no-env.mirror"], ["did you mean --randomization.no-mirror?"]),
+        (["--learner.no-double-qq"], ["did you mean --learner.no-double-q?"]),
+        (["--no-tensorboard"], ["unrecognized arguments: --no-tensorboard\n"]),
+        (["--num-envs", "1_0"], ["--num-envs", "'1_0'", "integer"]),
+        (["--num-envs", "\u0661\u0662"], ["--num-envs", "integer"]),
+        (["--total-episodes", "1e18"], ["--total-episodes", "'1e18'", "integer"]),
+        (["--learner.learning-rate", "1_0e-5"], ["--learner.learning-rate", "number"]),
+        (["--env.max-range", "\u0663"], ["--env.max-range", "number"]),
         (["maze"], ["unrecognized", "maze"]),
         (["--map"], ["--map", "expected one argument"]),
         (["--learner.double-q", "yes"], ["unrecognized", "yes"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -76,6 +77,29 @@ def test_the_probability_of_improvement_counts_pairs_and_halves_ties() -> None:
     # One task: Mann and Whitney's U over the number of pairs.
     u = stats.mannwhitneyu(ours[:, 0], theirs[:, 0]).statistic
     assert probability_of_improvement(ours[:, 0], theirs[:, 0]) == pytest.approx(u / 24)
+
+
+@pytest.mark.parametrize("block", [1, 250, 2**20])
+@pytest.mark.parametrize("size", [2, 101])
+def test_the_bootstrap_draws_the_same_in_blocks_of_any_size(
+    monkeypatch: pytest.MonkeyPatch, block: int, size: int
+) -> None:
+    values = np.random.default_rng(size).normal(size=size)
+    drawn = np.random.default_rng(0).integers(size, size=(500, size))
+    expected = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
+    monkeypatch.setattr("sqn_jax.evaluation.statistics.BLOCK", block)
+    assert bootstrap_interval(values, resamples=500) == tuple(expected)
+
+
+def test_the_bootstrap_of_many_values_takes_little_memory() -> None:
+    values = np.arange(300_000.0)
+    tracemalloc.start()
+    try:
+        bootstrap_interval(values, resamples=20)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 60e6  # All resamples at once would take 96 MB.
 
 
 def test_the_stratified_bootstrap_of_a_mean_is_near_that_of_scipy() -> None:

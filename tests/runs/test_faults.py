@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 from tiny_runs import TinyRuns, wait_for
 
-from sqn_jax.runs import train
+from sqn_jax.runs import streams, train
 
 
 @pytest.fixture(scope="module")
@@ -190,6 +190,48 @@ def stop_after(runs: TinyRuns, run: str, chunks: int, monkeypatch: pytest.Monkey
         code, _, err = runs.call(run)
     assert_stopped(runs, run, signal.SIGTERM, code, err)
     assert runs.saved(run) == [chunks - 1, chunks]
+
+
+def test_a_reader_that_leaves_stops_a_run_as_a_closed_terminal_does(
+    tiny: TinyRuns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks = []
+    with monkeypatch.context() as patch:
+        patch.setattr(streams, "reader_left", lambda: chunks.append(None) or len(chunks) == 3)
+        code, _, err = tiny.call("unread")
+    assert code == 128 + signal.SIGPIPE
+    assert "stopped by SIGPIPE after saving, resume with `sqn train" in err
+    assert tiny.saved("unread")[-1] == 3
+    code, _, err = tiny.call("unread", resume=True)
+    assert code == 0, err
+    tiny.assert_equal("unread", "straight")
+
+
+def test_a_run_goes_on_where_its_map_lies_now_if_it_is_the_same(tiny: TinyRuns) -> None:
+    for name in ("moved", "moved_map"):
+        shutil.rmtree(tiny.folder / name, ignore_errors=True)
+    shutil.copytree(tiny.folder / "straight", tiny.folder / "moved")
+    config_file = tiny.folder / "moved" / "config.json"
+    original = Path(json.loads(config_file.read_text())["map"])
+    config_file.write_text(config_file.read_text().replace(original.name, f"no_{original.name}"))
+    code, _, err = tiny.call("moved", resume=True)
+    assert code == 2
+    assert f"no_{original.name}: not found" in err
+    assert "--map" in err
+    code, _, err = tiny.call("moved", "--map", "maze", resume=True)
+    assert code == 2
+    assert "--map maze: differs in map.cells" in err
+    assert err.count("\n") == 1
+    moved = shutil.copytree(original.parent, tiny.folder / "moved_map", ignore=only_maps)
+    code, _, err = tiny.call("moved", "--map", str(moved / original.name), resume=True)
+    assert code == 0, err
+    assert json.loads(config_file.read_text())["map"] == str(moved / original.name)
+    tiny.assert_equal("moved", "straight")
+
+
+def only_maps(folder: str, names: list[str]) -> list[str]:
+    """What of the folder is no file of a map."""
+    return [name for name in names if not name.endswith((".yaml", ".pgm", ".png"))]
 
 
 # Disks.

@@ -9,7 +9,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from sqn_jax.agent.program import Program
 from sqn_jax.cli import main
+from sqn_jax.config.presets import PRESETS
+from sqn_jax.evaluation.agents import with_baselines
+from sqn_jax.evaluation.compare import load_maps, memory_bytes
+from sqn_jax.evaluation.settings import Settings
+from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.runs.final_evaluation import require_memory
 from sqn_jax.training import devices, memory_budget
 
 
@@ -77,3 +84,23 @@ def test_a_gpu_that_jax_cannot_use_is_worth_a_line(
     told = capsys.readouterr().err
     assert "running on the CPU" in told
     assert told.count("\n") == 1
+
+
+def test_an_evaluation_that_does_not_fit_is_refused_before_it_or_its_run_begins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    agents = with_baselines([], baselines=True)
+    settings = Settings(maps=("maze",), episodes=1_000, max_steps=50)
+    program = Program(PRESETS["paper"], 400, 5)
+    # Both agents under 5 seeds for 2 radii, 1 kB each; x, y and heading of 50 steps twice.
+    expected = 2 * 5 * 1_000 * 2 * 1_000 + 2 * 50 * 1_000 * 3 * 4
+    assert memory_bytes(agents, load_maps(agents, settings), settings) == expected
+    monkeypatch.setattr(memory_budget, "available_bytes", lambda: expected - 1.0)
+    with pytest.raises(ValueError, match=r"keeping the episodes .* lower one of --episodes, "):
+        evaluate_session(agents, settings)
+    # Pose, 5 values, 2 weights and 10 values of skills in 400 steps, four times.
+    monkeypatch.setattr(memory_budget, "available_bytes", lambda: 100 * 400 * 4 * 20 * 4.0 - 1)
+    with pytest.raises(ValueError, match=r"the final evaluation .* lower one of --eval.episodes, "):
+        require_memory(program)
+    monkeypatch.setattr(memory_budget, "available_bytes", lambda: 100 * 400 * 4 * 20 * 4.0)
+    require_memory(program)
