@@ -53,8 +53,8 @@ def load_policy(
         params: which parameters.
 
     Raises:
-        ValueError: the run keeps no such parameters, or it is no run folder, its config is unusable, or it holds no such checkpoint, or
-            a damaged one.
+        ValueError: the run keeps no such parameters, it is no run folder, its config is unusable,
+            or it holds no such checkpoint, or a damaged one.
         Mismatch: the checkpoint is of another run than the config says.
     """
     _, config = RunFolder.open(run_dir)
