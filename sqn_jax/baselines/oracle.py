@@ -119,11 +119,10 @@ class BeamSearch:
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
         config = env_params.config
-        shape = (env_params.body.height, env_params.body.width)
-        if occupancy_map.shape != shape:
+        if occupancy_map.shape != env_params.body.shape:
             raise ValueError(
                 f"map {occupancy_map.name!r} has {occupancy_map.shape} cells, "
-                f"expected {shape} as in env_params"
+                f"expected {env_params.body.shape} as in env_params"
             )
         self.forward = config.forward_speed * config.time_step
         self.backward = config.backward_speed * config.time_step

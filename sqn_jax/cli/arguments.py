@@ -63,6 +63,25 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_params(parser: argparse.ArgumentParser) -> None:
+    """Add the option --params."""
+    parser.add_argument(
+        "--params",
+        choices=["shipped", "latest", "average", "target"],
+        default="shipped",
+        help="which parameters of a run act: those it ships (default: the average where it keeps "
+        "one), the latest, the average, or those of the target network",
+    )
+
+
+def tasks(argument: str) -> str:
+    """Tasks to evaluate on: points, pairs, or a file."""
+    if argument in TASKS or argument.endswith(".json"):
+        return argument
+    known = ", ".join(TASKS)
+    raise argparse.ArgumentTypeError(f"is {argument!r}, expected {known} or a file ending in .json")
+
+
 def checkpoint(argument: str) -> int | str:
     """A checkpoint of a run: newest, best, or its number of chunks."""
     if argument in ("newest", "best"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sqn_jax.cli.arguments import (
     CACHE,
@@ -11,13 +13,18 @@ from sqn_jax.cli.arguments import (
     add_checkpoint,
     add_device,
     add_no_baselines,
+    add_params,
     integer,
     number,
     single_maps,
+    tasks,
 )
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.outside.messages import say, say_lines
 from sqn_jax.runs import streams
+
+if TYPE_CHECKING:
+    from sqn_jax.evaluation.agents import Agent
 
 
 def evaluate(arguments: list[str]) -> int:
@@ -25,34 +32,71 @@ def evaluate(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
     if not options.runs and options.no_baselines:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
-    from sqn_jax.evaluation.agents import group_policies, with_baselines
-    from sqn_jax.evaluation.scores import results_table
-    from sqn_jax.evaluation.settings import Settings
-    from sqn_jax.policies.pretrained import find_policy
-    from sqn_jax.runs.evaluate import evaluate_session
     from sqn_jax.training import devices
 
+    suite_file = _suite_file(options)
     devices.require(options.device)
-    noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
-    noise += [(0.0, level) for level in options.range_noise if level != 0]
-    settings = Settings(
-        maps=single_maps(options.maps),
-        tasks=tuple(TASKS[name] for name in options.tasks),
-        episodes=options.episodes,
-        eval_seeds=options.eval_seeds,
-        seed=options.seed,
-        noise=((0.0, 0.0), *noise),
-        noise_unit=options.noise_unit,
-        goal_radii=tuple(options.goal_radius),
-        max_steps=options.max_steps,
-    )
     if options.out is None:
         streams.require_output("--out FILE for the results")
     else:
         _require_writable(options.out)
-    trained = group_policies([find_policy(name, options.checkpoint) for name in options.runs])
-    agents = with_baselines(trained, baselines=not options.no_baselines)
-    evaluation = evaluate_session(agents, settings, options.out)
+    if suite_file is None:
+        _evaluate_drawn_tasks(options)
+    else:
+        _evaluate_suite(options, suite_file)
+    if options.out is not None:
+        say(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
+    return 0
+
+
+def _suite_file(options: argparse.Namespace) -> Path | None:
+    """The file of tasks, if one is asked for."""
+    files = [name for name in options.tasks if name not in TASKS]
+    if not files:
+        return None
+    if len(options.tasks) > 1:
+        raise ValueError(f"--tasks {' '.join(options.tasks)}: expected one file alone")
+    of_the_file = {
+        "--maps": options.maps,
+        "--max-steps": options.max_steps,
+        "--goal-radius": options.goal_radius,
+        "--noise-unit": options.noise_unit,
+    }
+    for option, value in of_the_file.items():
+        if value:
+            raise ValueError(f"{option}: not with --tasks {files[0]}, where the file says it")
+    return Path(files[0])
+
+
+def _agents(options: argparse.Namespace) -> list[Agent]:
+    """The policies, once for each epsilon, and the baselines."""
+    from sqn_jax.evaluation.agents import group_policies, with_baselines, with_epsilons
+    from sqn_jax.policies.pretrained import find_policy
+
+    policies = [find_policy(name, options.checkpoint, options.params) for name in options.runs]
+    trained = with_epsilons(group_policies(policies), options.epsilon)
+    return with_baselines(trained, baselines=not options.no_baselines)
+
+
+def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
+    from sqn_jax.evaluation.scores import results_table
+    from sqn_jax.evaluation.settings import Settings
+    from sqn_jax.runs.evaluate import evaluate_session
+
+    noise = [(level, 0.0) for level in options.velocity_noise if level != 0]
+    noise += [(0.0, level) for level in options.range_noise if level != 0]
+    settings = Settings(
+        maps=single_maps(options.maps or PAPER_MAPS),
+        tasks=tuple(TASKS[name] for name in options.tasks),
+        episodes=100 if options.episodes is None else options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        noise=((0.0, 0.0), *noise),
+        noise_unit=options.noise_unit,
+        goal_radii=tuple(options.goal_radius or (0.3, 0.5)),
+        max_steps=options.max_steps,
+    )
+    evaluation = evaluate_session(_agents(options), settings, options.out)
     say_lines(results_table(evaluation["results"]).split("\n"))
     for comparison in evaluation["comparisons"]:
         low, high = comparison["ci95"]
@@ -61,15 +105,35 @@ def evaluate(arguments: list[str]) -> int:
             f"{comparison['probability']:.2f}, 95 % interval [{low:.2f}, {high:.2f}] "
             "over training seeds"
         )
-    if options.out is not None:
-        say(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
-    return 0
+
+
+def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
+    from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table
+    from sqn_jax.evaluation.suites import SuiteSettings
+    from sqn_jax.runs.evaluate import evaluate_suite_session
+    from sqn_jax.tasks import read_suite
+
+    for option, levels in (
+        ("--velocity-noise", options.velocity_noise),
+        ("--range-noise", options.range_noise),
+    ):
+        if len(levels) > 1:
+            raise ValueError(f"{option}: {len(levels)} levels, expected one with a file of tasks")
+    suite = read_suite(file)
+    settings = SuiteSettings(
+        episodes=1 if options.episodes is None else options.episodes,
+        eval_seeds=options.eval_seeds,
+        seed=options.seed,
+        noise=(sum(options.velocity_noise), sum(options.range_noise)),
+    )
+    evaluation = evaluate_suite_session(_agents(options), suite, settings, options.out, file)
+    say_lines([*suite_table(evaluation).split("\n"), *comparison_lines(evaluation)])
 
 
 def _parser() -> Parser:
     parser = Parser(
         prog="sqn evaluate",
-        description="Run greedy episodes of trained policies; all agents get the same tasks.",
+        description="Run episodes of trained policies and baselines; all get the same tasks.",
         epilog=CACHE,
         allow_abbrev=False,
     )
@@ -80,16 +144,20 @@ def _parser() -> Parser:
         metavar="RUN",
         help="run folders, pretrained:NAME or files NAME.npz; default: only the baselines",
     )
-    add("--maps", nargs="+", default=list(PAPER_MAPS), help="names or files (default: the four)")
+    add("--maps", nargs="+", default=[], help="names or files (default: the four)")
     add(
         "--tasks",
         nargs="+",
-        choices=list(TASKS),
+        type=tasks,
         default=["points"],
         metavar="TASKS",
-        help="points, pairs or both (default: points)",
+        help="points, pairs or both (default: points), or a file of tasks, see sqn tasks",
     )
-    add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
+    add(
+        "--episodes",
+        type=integer,
+        help="per evaluation seed (default 100), for a file of tasks per task too (default 1)",
+    )
     add("--eval-seeds", type=integer, default=5, help="number of evaluation seeds (default 5)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
     add("--velocity-noise", nargs="+", type=number, default=[], metavar="S", help="e.g. 0.1 0.2")
@@ -101,9 +169,20 @@ def _parser() -> Parser:
         default=0,
         help="steps per episode (default: each map's limit)",
     )
-    add("--goal-radius", nargs="+", type=number, default=[0.3, 0.5], metavar="M", help="m")
+    add(
+        "--goal-radius", nargs="+", type=number, default=[], metavar="M", help="m (default 0.3 0.5)"
+    )
+    add(
+        "--epsilon",
+        nargs="+",
+        type=number,
+        default=[0.0],
+        metavar="E",
+        help="probability of a random action, several give a row each (default 0: greedy)",
+    )
     add_no_baselines(parser)
     add_checkpoint(parser)
+    add_params(parser)
     add_device(parser)
     add("--out", type=Path, help="JSON file; the records of the episodes go beside it as .jsonl")
     return parser

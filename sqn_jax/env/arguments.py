@@ -70,10 +70,10 @@ def require_place(name: str, place: object, size: int, params: EnvParams) -> Arr
         array = jnp.zeros(())
     if array.shape != (size,):
         raise ValueError(f"{name} is {_described(place)}, expected {size} numbers")
-    if _is_traced(array) or _is_traced(params.sight.resolution):
+    if _is_traced(array) or _is_traced(params.sight.resolution) or params.sight.width.ndim > 0:
         return array
     numbers = np.asarray(array)
-    extent = np.array([params.sight.width, params.sight.height]) * float(params.sight.resolution)
+    extent = np.array(params.sight.shape[::-1]) * float(params.sight.resolution)
     if not (
         np.isfinite(numbers).all() and (numbers[:2] >= 0).all() and (numbers[:2] < extent).all()
     ):

@@ -202,9 +202,9 @@ def _ray_grid(
     sides = far_sides(free_rectangles(blocked, sectors, reach))
     return RayGrid(
         far_sides=jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1)),
+        first_entry=jnp.int32(0),
         resolution=jnp.float32(resolution),
-        height=height,
-        width=width,
+        width=jnp.int32(width),
         sectors=sectors,
     )
 

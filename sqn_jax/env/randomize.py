@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.config import RandomizationConfig
 from sqn_jax.env.params import EnvParams
+from sqn_jax.env.several_maps import own_map_axes
 
 
 def randomized(params: EnvParams, config: RandomizationConfig, num_envs: int) -> EnvParams:
@@ -63,7 +64,12 @@ def robots_own(params: EnvParams) -> list[str]:
 def robot_axes(params: EnvParams) -> Any:
     """For `jax.vmap` over N robots: axis 0 for what each has of its own, None for the rest."""
     shared = jax.tree.map(lambda _: None, params)
-    return dataclasses.replace(shared, **dict.fromkeys(robots_own(params), 0))
+    axes = dataclasses.replace(shared, **dict.fromkeys(robots_own(params), 0))
+    if jnp.ndim(params.sight.first_entry) > 0:
+        axes = dataclasses.replace(
+            axes, sight=own_map_axes(axes.sight), body=own_map_axes(axes.body)
+        )
+    return axes
 
 
 def _spread(count: int) -> NDArray[np.float64]:

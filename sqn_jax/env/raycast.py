@@ -18,19 +18,28 @@ from sqn_jax.env.loops import repeat
 
 @struct.dataclass
 class RayGrid:
-    """A map prepared for rays by `free_space.far_sides`."""
+    """A map prepared for rays by `free_space.far_sides`, or several one after the other.
+
+    Of several maps `first_entry`, `resolution` and `width` have an axis, of maps or of robots.
+    """
 
     far_sides: Array
     """[H * W * sectors] int16, where the free rectangle of a cell ends; 0 in the first sector of a
     blocked cell. The sectors of a cell lie together: a robot's beams start in one cell."""
+    first_entry: Array
+    """int32: where in `far_sides` the map begins."""
     resolution: Array
     """m per cell."""
-    height: int = struct.field(pytree_node=False)
-    """Rows H."""
-    width: int = struct.field(pytree_node=False)
-    """Columns W."""
+    width: Array
+    """int32: columns W."""
     sectors: int = struct.field(pytree_node=False)
     """Sectors of direction in the table."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) of a single map."""
+        width = int(self.width)
+        return self.far_sides.size // (self.sectors * width), width
 
 
 def cast_rays(
@@ -107,7 +116,8 @@ def _hop(
     own_cell = jnp.floor(in_cells)
     x, y = in_cells - own_cell
     column, row = to_integer(own_cell)
-    table_start = to_integer(sector) + (row * grid.width + column) * grid.sectors
+    own_entry = grid.first_entry + (row * grid.width + column) * grid.sectors
+    table_start = own_entry + to_integer(sector)
     limit = max_range / grid.resolution
 
     def hop(_: Array | int, traveled: Array) -> Array:
@@ -128,7 +138,7 @@ def _hop(
 def is_blocked(grid: RayGrid, position: Array) -> Array:
     """Whether the cell at a position [2] m is blocked; the position must lie on the map."""
     column, row = to_integer(jnp.floor(position / grid.resolution))
-    return _look_up(grid, (row * grid.width + column) * grid.sectors) == 0
+    return _look_up(grid, grid.first_entry + (row * grid.width + column) * grid.sectors) == 0
 
 
 def _look_up(grid: RayGrid, place: Array) -> Array:

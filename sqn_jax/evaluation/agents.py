@@ -7,13 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.config.validation import require_limits
 from sqn_jax.evaluation import baseline_episodes, episodes
+from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.settings import Settings, World, task_key
 from sqn_jax.evaluation.statistics import success_weighted_path_length
 from sqn_jax.policies.run_policies import Policy
@@ -39,27 +43,29 @@ class Agent(Protocol):
     def training_seeds(self) -> Sequence[int | None]:
         """Seeds of the training runs; a single None for an agent that was not trained."""
 
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action in each step."""
+
     def run(
         self,
-        eval_seed: int,
-        training_seed: int | None,
+        eval_seeds: Sequence[int],
         world: World,
         settings: Settings,
         fields: Sequence[str],
         on_batch: OnBatch,
-    ) -> tuple[list[EpisodeMetrics], Trajectory]:
-        """Run the episodes of an evaluation seed.
+    ) -> list[list[EpisodeResults]]:
+        """Run the episodes of evaluation seeds with the policies of all training seeds.
 
         Args:
-            eval_seed: determines tasks and noise.
-            training_seed: selects the policy.
+            eval_seeds: determine tasks and noise.
             world: the world to run in.
             settings: the number of episodes E and the goal radii.
             fields: the fields of `Trajectory` to return.
             on_batch: called after each batch of episodes.
 
         Returns:
-            The metrics for each goal radius, [E] each, and the trajectory with these fields.
+            For each evaluation seed and each training seed the results of E episodes.
         """
 
 
@@ -69,6 +75,8 @@ class TrainedAgent:
 
     name: str
     policies: tuple[Policy, ...]
+    epsilon: float = 0.0
+    """Probability of a random action in each step; 0 is greedy."""
 
     @property
     def algorithm(self) -> str:
@@ -91,24 +99,36 @@ class TrainedAgent:
         params_of_seeds = [params for policy in self.policies for params in policy.params]
         return params_of_seeds[self.training_seeds.index(training_seed)]
 
+    def stacked_params(self) -> Params:
+        """The parameters of all training seeds, with a leading axis [S]."""
+        params_of_seeds = [params for policy in self.policies for params in policy.params]
+        return jax.tree.map(lambda *x: jnp.stack(x), *params_of_seeds)
+
     def run(
         self,
-        eval_seed: int,
-        training_seed: int | None,
+        eval_seeds: Sequence[int],
         world: World,
         settings: Settings,
         fields: Sequence[str],
         on_batch: OnBatch,
-    ) -> tuple[list[EpisodeMetrics], Trajectory]:
-        return episodes.run_episodes(
-            episodes.episode_keys(task_key(eval_seed, world.tasks), settings.episodes),
-            self.params(training_seed),
+    ) -> list[list[EpisodeResults]]:
+        keys = [
+            episodes.episode_keys(task_key(seed, world.tasks), settings.episodes)
+            for seed in eval_seeds
+        ]
+        of_policies = episodes.run_seeds(
+            jnp.concatenate(keys),
+            self.stacked_params(),
             world.env_params,
             self.network,
+            epsilon=self.epsilon,
             goal_radii=settings.goal_radii,
             fields=fields,
             on_batch=on_batch,
         )
+        first = [index * settings.episodes for index in range(len(eval_seeds))]
+        own = [slice(start, start + settings.episodes) for start in first]
+        return [[results.of_episodes(chosen) for results in of_policies] for chosen in own]
 
 
 @dataclass(frozen=True)
@@ -118,6 +138,7 @@ class BaselineAgent:
     name: Literal["oracle", "bug"]
     env_config: EnvConfig
     training_seeds: Sequence[int | None] = (None,)
+    epsilon: float = 0.0
 
     @property
     def algorithm(self) -> str:
@@ -125,28 +146,41 @@ class BaselineAgent:
 
     def run(
         self,
-        eval_seed: int,
-        training_seed: int | None,
+        eval_seeds: Sequence[int],
         world: World,
         settings: Settings,
         fields: Sequence[str],
         on_batch: OnBatch,
-    ) -> tuple[list[EpisodeMetrics], Trajectory]:
-        del training_seed
-        key = task_key(eval_seed, world.tasks)
+    ) -> list[list[EpisodeResults]]:
+        return [
+            [self._run_seed(eval_seed, world, settings, fields, on_batch)]
+            for eval_seed in eval_seeds
+        ]
+
+    def _run_seed(
+        self,
+        eval_seed: int,
+        world: World,
+        settings: Settings,
+        fields: Sequence[str],
+        on_batch: OnBatch,
+    ) -> EpisodeResults:
         if self.name == "oracle":
             choose = baseline_episodes.oracle(world.occupancy_map, world.env_params)
         else:
             choose = baseline_episodes.bug(world.env_params, settings.episodes)
+        needed = tuple(dict.fromkeys(("poses", "goals", *fields)))
         metrics, trajectory = baseline_episodes.run_baseline(
-            episodes.episode_keys(key, settings.episodes),
+            episodes.episode_keys(task_key(eval_seed, world.tasks), settings.episodes),
             choose,
             world.env_params,
             goal_radii=settings.goal_radii,
-            fields=fields,
+            fields=needed,
         )
         on_batch(settings.episodes)
-        return metrics, trajectory
+        # A copy, or the starts would keep all poses in memory.
+        starts = np.array(trajectory.poses[0])
+        return EpisodeResults(metrics, starts, trajectory.goals, trajectory.only(*fields))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +255,24 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
             raise ValueError(f"runs {folders}: the same settings and the same training seed twice")
         agents.append(agent)
     return agents
+
+
+def with_epsilons(agents: Sequence[TrainedAgent], epsilons: Sequence[float]) -> list[TrainedAgent]:
+    """Each agent once for each probability of a random action; named by it, if it is more than 0.
+
+    Raises:
+        ValueError: a probability is not in 0..1, or comes twice.
+    """
+    for epsilon in epsilons:
+        require_limits(epsilon, "epsilon", 0, 1)
+        if epsilons.count(epsilon) > 1:
+            raise ValueError(f"epsilon: {epsilon} comes twice, expected each once")
+
+    def named(agent: TrainedAgent, epsilon: float) -> TrainedAgent:
+        name = f"{agent.name}, epsilon {epsilon:g}" if epsilon > 0 else agent.name
+        return dataclasses.replace(agent, name=name, epsilon=epsilon)
+
+    return [named(agent, epsilon) for agent in agents for epsilon in epsilons]
 
 
 def with_baselines(agents: Sequence[Agent], *, baselines: bool) -> list[Agent]:

@@ -20,7 +20,16 @@ from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.baselines.bug import BugNavigator
 from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
-from sqn_jax.evaluation.episodes import metrics_of, start_by_hand, step_by_hand
+from sqn_jax.env.several_maps import select_maps
+from sqn_jax.evaluation.episodes import (
+    EpisodeResults,
+    GivenTasks,
+    judged,
+    metrics_of,
+    start_by_hand,
+    step_by_hand,
+    task_metrics,
+)
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.training.rollout import EpisodeMetrics, with_ends
 
@@ -84,19 +93,55 @@ def run_baseline(
         The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
         `output` is a placeholder: one skill of weight 1 whose action values are 0.
     """
-    step_keys, first = start_by_hand(keys, env_params)
     # Observations of many episodes take much memory and are rarely needed.
-    needed = {"actions", "rewards", "terminated", "poses", "info"} | ({"obs"} & set(fields))
+    needed = ("actions", *(("obs",) if "obs" in fields else ()))
+    trajectory = _run(keys, choose, env_params, needed)
+    trajectory = dataclasses.replace(trajectory, output=_one_skill(trajectory))
+    radii = goal_radii or [float(env_params.goal_radius)]
+    return metrics_of(trajectory, radii), jax.device_get(trajectory.only(*fields))
+
+
+def run_on_tasks(
+    keys: Array,
+    choose: Choose,
+    env_params: EnvParams,
+    tasks: GivenTasks,
+    *,
+    collision_ends: bool = False,
+) -> EpisodeResults:
+    """Run whole episodes of given tasks with actions chosen on the host.
+
+    Args:
+        keys: [E] from `episodes.episode_keys`.
+        choose: chooses the actions; a new function for each run.
+        env_params: from `env.several_maps.join_maps`.
+        tasks: [E] of them.
+        collision_ends: whether a refused move makes a task fail.
+    """
+    trajectory = _run(keys, choose, select_maps(env_params, tasks.maps), (), tasks)
+    stacked = jax.tree.map(lambda x: x[None], judged(trajectory))
+    metrics = task_metrics(stacked, tasks, jnp.bool_(collision_ends))
+    on_host = jax.tree.map(lambda x: np.asarray(x[0]), metrics)
+    starts, goals = jax.device_get((trajectory.poses[0], trajectory.goals))
+    return EpisodeResults([on_host], starts, goals, Trajectory())
+
+
+def _run(
+    keys: Array,
+    choose: Choose,
+    env_params: EnvParams,
+    fields: Sequence[str],
+    tasks: GivenTasks | None = None,
+) -> Trajectory:
+    """The trajectory of E robots, with these fields and those that metrics need."""
+    step_keys, first = start_by_hand(keys, env_params, tasks)
+    needed = ("rewards", "terminated", "poses", "info", *fields)
     actors, steps = first, []
     for keys_of_step in step_keys:
         actions = jnp.asarray(choose(actors.obs, actors.env_state), jnp.int32)
         actors, step = step_by_hand(keys_of_step, actors, actions, env_params)
         steps.append(jax.device_get(step.only(*needed)))
-    stacked = jax.tree.map(lambda *parts: np.stack(parts), *steps)
-    trajectory = with_ends(stacked, first, actors)
-    trajectory = dataclasses.replace(trajectory, output=_one_skill(stacked))
-    radii = goal_radii or [float(env_params.goal_radius)]
-    return metrics_of(trajectory, radii), jax.device_get(trajectory.only(*fields))
+    return with_ends(jax.tree.map(lambda *parts: np.stack(parts), *steps), first, actors)
 
 
 def _one_skill(steps: Trajectory) -> QOutput:

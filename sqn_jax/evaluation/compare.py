@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,9 @@ from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import load_map
+
+EPISODES_AT_ONCE = 2_000
+"""Episodes of each policy whose results are held at once, unless one evaluation seed has more."""
 
 OnEvaluated = Callable[[EpisodeBatch], object]
 """Called with the episodes of a training seed in a world under an evaluation seed."""
@@ -49,7 +52,9 @@ def memory_bytes(
         numbers += 5 + 6 * max(_num_skills(agent) for agent in agents)
     batches = 2 + (len(settings.tasks) * len(maps) * settings.eval_seeds if fields else 0)
     records = num_episodes(agents, settings) * len(settings.goal_radii)
-    return RECORD_BYTES * records + 4.0 * numbers * steps * settings.episodes * batches
+    held = min(settings.episodes * settings.eval_seeds, max(EPISODES_AT_ONCE, settings.episodes))
+    joined = 2 * held + (batches - 2) * settings.episodes
+    return RECORD_BYTES * records + 4.0 * numbers * steps * joined
 
 
 def _num_skills(agent: Agent) -> int:
@@ -85,7 +90,7 @@ def evaluate_agents(
     maps: Maps,
     settings: Settings,
     on_batch: OnBatch = lambda count: None,
-    on_evaluated: OnEvaluated = lambda batch: None,
+    on_evaluated: OnEvaluated | None = None,
     fields: Sequence[str] = (),
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Run every agent in every world.
@@ -109,14 +114,17 @@ def evaluate_agents(
     quiet: dict[str, list[list[EpisodeBatch]]] = {agent.name: [] for agent in agents}
     robots = {agent.name: robot_for(agent.env_config, settings) for agent in agents}
     main_radius = settings.goal_radii[0]
+    # Whole trajectories come to the host only where somebody looks at them.
+    needed = () if on_evaluated is None else tuple(dict.fromkeys(("poses", "goals", *fields)))
     for robot in dict.fromkeys(robots.values()):
         paths: dict[bytes, NDArray[np.float64]] = {}
         for world in worlds(robot, maps, settings):
             actors = [agent for agent in agents if robots[agent.name] == robot]
             evaluated: dict[str, list[EpisodeBatch]] = {agent.name: [] for agent in actors}
             for agent in actors:
-                for batch in _batches(agent, world, settings, paths, on_batch, fields):
-                    on_evaluated(batch)
+                for batch in _batches(agent, world, settings, paths, on_batch, needed):
+                    if on_evaluated is not None:
+                        on_evaluated(batch)
                     # The steps of many episodes would fill the memory; statistics need none.
                     without_steps = dataclasses.replace(batch, trajectory=batch.trajectory.only())
                     evaluated[agent.name].append(without_steps)
@@ -152,27 +160,29 @@ def _batches(
     `paths` caches the lengths of the shortest paths, m, by task.
     """
     robot_radius = world.env_params.config.robot_radius
-    needed = tuple(dict.fromkeys(("poses", "goals", *fields)))
-    for eval_seed, training_seed in product(settings.all_eval_seeds, agent.training_seeds):
-        metrics, trajectory = agent.run(eval_seed, training_seed, world, settings, needed, on_batch)
-        # A copy, or the starts would keep all poses in memory.
-        starts, goals = np.array(trajectory.poses[0]), np.asarray(trajectory.goals)
-        tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
-        if tasks not in paths:
-            paths[tasks] = shortest_path_lengths(
-                world.occupancy_map, starts, goals, robot_radius=robot_radius
+    eval_seeds = settings.all_eval_seeds
+    at_once = max(1, EPISODES_AT_ONCE // settings.episodes)
+    for first in range(0, len(eval_seeds), at_once):
+        block = eval_seeds[first : first + at_once]
+        results = agent.run(block, world, settings, fields, on_batch)
+        of_seeds = zip(product(block, agent.training_seeds), chain(*results), strict=True)
+        for (eval_seed, training_seed), (metrics, starts, goals, trajectory) in of_seeds:
+            tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
+            if tasks not in paths:
+                paths[tasks] = shortest_path_lengths(
+                    world.occupancy_map, starts, goals, robot_radius=robot_radius
+                )
+            yield EpisodeBatch(
+                agent=agent,
+                world=world,
+                training_seed=training_seed,
+                eval_seed=eval_seed,
+                metrics=dict(zip(settings.goal_radii, metrics, strict=True)),
+                starts=starts,
+                goals=goals,
+                shortest_paths=paths[tasks],
+                trajectory=trajectory,
             )
-        yield EpisodeBatch(
-            agent=agent,
-            world=world,
-            training_seed=training_seed,
-            eval_seed=eval_seed,
-            metrics=dict(zip(settings.goal_radii, metrics, strict=True)),
-            starts=starts,
-            goals=goals,
-            shortest_paths=paths[tasks],
-            trajectory=trajectory,
-        )
 
 
 def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
@@ -187,6 +197,7 @@ def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
         "range_noise": world.noise[1],
         "range_noise_unit": config.range_noise_unit,
         "goal_radius": radius,
+        "epsilon": agent.epsilon,
     }
 
 

@@ -1,24 +1,28 @@
-"""Greedy episodes of a trained policy, without exploration and without auto-reset.
+"""Episodes of trained policies, without learning and without auto-reset.
 
-Episodes always run `BATCH` at a time in the same compiled program, whatever is returned of them. So
-an episode is the same bit for bit whether it runs alone or beside others, for a score or a picture.
+Training seeds, evaluation seeds and episodes are axes of one compiled call. Episodes always run
+`BATCH` at a time in the same compiled program, whatever is returned of them. So an episode is the
+same bit for bit whether it runs alone or beside others, for a score or a picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.agent.trajectory import Trajectory, over_robots
-from sqn_jax.env import EnvParams
+from sqn_jax.env import EnvParams, EnvState, Observation, reset_to
+from sqn_jax.env.randomize import robot_axes
+from sqn_jax.env.several_maps import select_maps
 from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
@@ -39,8 +43,24 @@ def episode_keys(key: Array, num_episodes: int) -> Array:
     return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_episodes))
 
 
+@struct.dataclass
+class GivenTasks:
+    """Tasks that are given instead of drawn, one for each of E episodes."""
+
+    starts: Array
+    """[E, 3] x m, y m, heading rad; a heading that is NaN is drawn."""
+    goals: Array
+    """[E, 2] x m, y m."""
+    maps: Array
+    """[E] int32: which map of `env.several_maps.join_maps` each lies on."""
+    max_steps: Array
+    """[E] int32: steps until the episode ends as a failure, at most those of the world."""
+    goal_radii: Array
+    """[E] m."""
+
+
 def start_episodes(
-    keys: Array, carry: Array, env_params: EnvParams
+    keys: Array, carry: Array, env_params: EnvParams, tasks: GivenTasks | None = None
 ) -> tuple[RandomDraws, ActorState]:
     """Start the episodes of these keys: the random draws of their steps, and the first state.
 
@@ -50,7 +70,8 @@ def start_episodes(
     Args:
         keys: [E] from `episode_keys`.
         carry: [E, H] the initial carry.
-        env_params: the world.
+        env_params: the world, or that of each robot.
+        tasks: the tasks; None: drawn from the world.
 
     Returns:
         The random draws [T, E], and the actor state with starts, goals and first observations.
@@ -61,8 +82,103 @@ def start_episodes(
         draws = random_draws(draws_key, env_params.max_steps, 1)
         return jax.random.split(start_key, 1)[0], jax.tree.map(lambda x: x[:, 0], draws)
 
+    def begin(
+        key: Array, start: Array, goal: Array, world: EnvParams
+    ) -> tuple[Observation, EnvState]:
+        heading_key, noise_key = jax.random.split(key)
+        drawn = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
+        heading = jnp.where(jnp.isnan(start[2]), drawn, start[2])
+        return reset_to(noise_key, start.at[2].set(heading), goal, world)
+
     start_keys, draws = jax.vmap(split, out_axes=(0, 1))(keys)
-    return draws, ActorState(*reset_robots(start_keys, env_params), carry)
+    if tasks is None:
+        return draws, ActorState(*reset_robots(start_keys, env_params), carry)
+    begin_all = jax.vmap(begin, in_axes=(0, 0, 0, robot_axes(env_params)))
+    obs, env_state = begin_all(start_keys, tasks.starts, tasks.goals, env_params)
+    return draws, ActorState(obs, env_state, carry)
+
+
+class EpisodeResults(NamedTuple):
+    """What came of E episodes of one policy; NumPy arrays."""
+
+    metrics: list[EpisodeMetrics]
+    """For each goal radius, for given tasks once; [E] each."""
+    starts: NDArray[np.floating]
+    """[E, 3] x m, y m, heading rad."""
+    goals: NDArray[np.floating]
+    """[E, 2] x m, y m."""
+    trajectory: Trajectory
+    """The requested fields of all steps."""
+
+    def of_episodes(self, chosen: slice) -> EpisodeResults:
+        """Some of the episodes."""
+        metrics = jax.tree.map(lambda x: x[chosen], self.metrics)
+        trajectory = self.trajectory.of_robots(chosen)
+        return EpisodeResults(metrics, self.starts[chosen], self.goals[chosen], trajectory)
+
+
+def run_seeds(
+    keys: Array,
+    params: Params,
+    env_params: EnvParams,
+    network: QNetwork,
+    *,
+    epsilon: float = 0.0,
+    goal_radii: Sequence[float] = (),
+    fields: Sequence[str] = (),
+    on_batch: Callable[[int], object] = lambda count: None,
+    tasks: GivenTasks | None = None,
+    collision_ends: bool = False,
+) -> list[EpisodeResults]:
+    """Run the same episodes with S policies in one compiled call, a batch of episodes at a time.
+
+    Args:
+        keys: [E] from `episode_keys`; independent of any training key.
+        params: parameters of the networks, with a leading axis [S].
+        env_params: the world, with its noise; for given tasks from `env.several_maps.join_maps`.
+        network: the network of these parameters.
+        epsilon: probability of a random action in each step; 0 is greedy.
+        goal_radii: m, within which the goal is reached; default: `env_params.goal_radius` only.
+        fields: the fields of `Trajectory` to return; all together take about 0.4 kB per step.
+        on_batch: called after each batch with its number of episodes, of all policies together.
+        tasks: the tasks of the episodes, with radii of their own; None: drawn from the world.
+        collision_ends: whether a refused move makes a given task fail.
+
+    Returns:
+        The results of each policy.
+    """
+    radii = goal_radii or [float(env_params.goal_radius)]
+    num_policies = len(jax.tree.leaves(params)[0])
+    batches = []
+    for first in range(0, len(keys), BATCH):
+        count = min(BATCH, len(keys) - first)
+        chosen = first + jnp.arange(BATCH) % count  # The rest of a batch is padding.
+        of_batch = None if tasks is None else jax.tree.map(lambda x, i=chosen: x[i], tasks)
+        trajectory = _run_batch(keys[chosen], params, env_params, network, epsilon, of_batch)
+        if of_batch is None:
+            metrics = [_metrics(judged(trajectory), jnp.float32(radius)) for radius in radii]
+        else:
+            metrics = [task_metrics(judged(trajectory), of_batch, jnp.bool_(collision_ends))]
+        ends = trajectory.poses[:, 0], trajectory.goals
+        of_policies = jax.device_get((metrics, *ends, trajectory.only(*fields)))
+        results = [
+            EpisodeResults(*jax.tree.map(lambda x, i=index: x[i], of_policies))
+            for index in range(num_policies)
+        ]
+        batches.append([result.of_episodes(slice(count)) for result in results])
+        on_batch(num_policies * count)
+    return [join_results(results) for results in zip(*batches, strict=True)]
+
+
+def join_results(batches: Sequence[EpisodeResults]) -> EpisodeResults:
+    """The results of several batches of episodes of one policy, in their order."""
+
+    def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+        return np.concatenate(parts, axis)
+
+    metrics, starts, goals, trajectories = zip(*batches, strict=True)
+    trajectory = over_robots(join, *trajectories)
+    return EpisodeResults(jax.tree.map(join, *metrics), join(*starts), join(*goals), trajectory)
 
 
 def run_episodes(
@@ -71,77 +187,92 @@ def run_episodes(
     env_params: EnvParams,
     network: QNetwork,
     *,
-    goal_radii: Sequence[float] = (),
     fields: Sequence[str] = ("poses", "goals"),
-    on_batch: Callable[[int], object] = lambda count: None,
+    **options: Any,
 ) -> tuple[list[EpisodeMetrics], Trajectory]:
-    """Run greedy episodes of one policy.
+    """Run episodes of one policy.
 
     Args:
-        keys: [E] from `episode_keys`; independent of any training key.
-        params: parameters of one network, without a seed axis.
-        env_params: the world, with its noise.
+        keys: [E] from `episode_keys`.
+        params: parameters of one network, without an axis of seeds.
+        env_params: the world.
         network: the network of these parameters.
-        goal_radii: m, within which the goal is reached; default: `env_params.goal_radius` only.
-        fields: the fields of `Trajectory` to return; all together take about 0.4 kB per step.
-        on_batch: called after each batch with its number of episodes.
+        fields: the fields of `Trajectory` to return.
+        options: others of `run_seeds`.
 
     Returns:
         The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
     """
-    radii = goal_radii or [float(env_params.goal_radius)]
-    metrics: list[list[EpisodeMetrics]] = []
-    trajectories: list[Trajectory] = []
-    for first in range(0, len(keys), BATCH):
-        batch = keys[first : first + BATCH]
-        full = batch[jnp.arange(BATCH) % len(batch)]
-        real = slice(len(batch))  # The rest of a batch is padding.
-        trajectory = _run_batch(full, params, env_params, network)
-        metrics.append(jax.tree.map(lambda x, real=real: x[real], metrics_of(trajectory, radii)))
-        trajectories.append(jax.device_get(trajectory.only(*fields)).of_robots(real))
-        on_batch(len(batch))
-
-    def join(*parts: NDArray[Any], axis: int = 0) -> NDArray[Any]:
-        return np.concatenate(parts, axis)
-
-    joined: list[EpisodeMetrics] = jax.tree.map(join, *metrics)
-    return joined, over_robots(join, *trajectories)
+    stacked = jax.tree.map(lambda x: x[None], params)
+    (results,) = run_seeds(keys, stacked, env_params, network, fields=fields, **options)
+    return results.metrics, results.trajectory
 
 
 @partial(jax.jit, static_argnames="network")
-def _run_batch(keys: Array, params: Params, env_params: EnvParams, network: QNetwork) -> Trajectory:
+def _run_batch(
+    keys: Array,
+    params: Params,
+    env_params: EnvParams,
+    network: QNetwork,
+    epsilon: float,
+    tasks: GivenTasks | None,
+) -> Trajectory:
+    """Trajectories [S, T, E, ...] of policies [S]."""
+    if tasks is not None:
+        env_params = select_maps(env_params, tasks.maps)
     carry = initial_carry(network.config, len(keys))
-    draws, actors = start_episodes(keys, carry, env_params)
-    _, trajectory = unroll(draws, params, actors, jnp.zeros(len(keys)), env_params, network)
-    return trajectory
+    draws, actors = start_episodes(keys, carry, env_params, tasks)
+    epsilons = jnp.full(len(keys), epsilon, jnp.float32)
+
+    def run(params: Params) -> Trajectory:
+        return unroll(draws, params, actors, epsilons, env_params, network)[1]
+
+    if len(jax.tree.leaves(params)[0]) == 1:
+        # An axis of one would only be in the compiler's way.
+        alone = run(jax.tree.map(lambda x: x[0], params))
+        return jax.tree.map(lambda x: x[None], alone)
+    return jax.vmap(run)(params)
 
 
 def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
-    """`episode_metrics` for each radius, m; NumPy arrays [E].
-
-    A program of its own, so that the program of the episodes is the same for all radii.
-    """
-    needed = trajectory.only("rewards", "poses", "info")
-    metrics = [_metrics(needed, jnp.float32(radius)) for radius in goal_radii]
-    on_host: list[EpisodeMetrics] = jax.device_get(metrics)
+    """`episode_metrics` of one policy for each radius, m; NumPy arrays [E]."""
+    stacked = jax.tree.map(lambda x: x[None], judged(trajectory))
+    metrics = jax.device_get([_metrics(stacked, jnp.float32(radius)) for radius in goal_radii])
+    on_host: list[EpisodeMetrics] = jax.tree.map(lambda x: x[0], metrics)
     return on_host
 
 
-_metrics = jax.jit(episode_metrics)
+def judged(trajectory: Trajectory) -> Trajectory:
+    """The part of a trajectory that decides the metrics."""
+    return trajectory.only("rewards", "poses", "info")
+
+
+# Programs of their own, so that the program of the episodes is the same for all radii.
+_metrics = jax.jit(jax.vmap(episode_metrics, in_axes=(0, None)))
 
 
 @jax.jit
-def start_by_hand(keys: Array, env_params: EnvParams) -> tuple[Array, ActorState]:
-    """Start the episodes of `run_episodes` for an agent that is not a network.
+def task_metrics(trajectory: Trajectory, tasks: GivenTasks, collision_ends: Array) -> Any:
+    """The metrics [S, E] of given tasks, out of trajectories [S, T, E, ...]."""
+    judge = jax.vmap(episode_metrics, in_axes=(0, None, None, None))
+    return judge(trajectory, tasks.goal_radii, tasks.max_steps, collision_ends)
+
+
+@jax.jit
+def start_by_hand(
+    keys: Array, env_params: EnvParams, tasks: GivenTasks | None = None
+) -> tuple[Array, ActorState]:
+    """Start the episodes of `run_seeds` for an agent that is not a network.
 
     Args:
         keys: [E] from `episode_keys`.
-        env_params: the world.
+        env_params: the world, or that of each robot.
+        tasks: the tasks; None: drawn from the world.
 
     Returns:
         The keys [T, E] for `step_by_hand`, and the actor state, whose carry is empty [E, 0].
     """
-    draws, actors = start_episodes(keys, jnp.zeros((len(keys), 0)), env_params)
+    draws, actors = start_episodes(keys, jnp.zeros((len(keys), 0)), env_params, tasks)
     return draws.step_keys, actors
 
 

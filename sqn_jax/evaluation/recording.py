@@ -283,7 +283,9 @@ def record_episodes(
         The episodes; a step takes about 0.5 kB, plus up to several kB for its covered points.
     """
     params, env_params = agent.params(training_seed), world.env_params
-    _, trajectory = run_episodes(keys, params, env_params, agent.network, fields=RECORDED)
+    _, trajectory = run_episodes(
+        keys, params, env_params, agent.network, epsilon=agent.epsilon, fields=RECORDED
+    )
     covered = jax.device_get(_covered(trajectory.poses, env_params))
     trajectory = dataclasses.replace(trajectory, covered=covered)
     return [

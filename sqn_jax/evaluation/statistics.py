@@ -6,7 +6,9 @@ it import it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,3 +137,99 @@ def success_weighted_path_length(
 def _runs_by_tasks(scores: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(scores, np.float64)
     return array[:, None] if array.ndim == 1 else array
+
+
+def clustered_interval(
+    scores: ArrayLike,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+    *,
+    is_rate: bool = False,
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean that resamples training seeds and tasks.
+
+    Both are drawn with replacement, each as a whole, so that episodes of one task or of one policy
+    do not count as independent evidence.
+
+    Args:
+        scores: [S, M] means of S training seeds on M tasks.
+        confidence: of the interval.
+        resamples: the number of resamples.
+        seed: of the random draws.
+        is_rate: whether the scores are rates of success. Where all are 0, or all 1, resampling
+            shows no spread; the interval is then Wilson's for M tasks.
+
+    Raises:
+        ValueError: no scores.
+    """
+    array = np.asarray(scores, np.float64)
+    if array.size == 0:
+        raise ValueError("an interval needs at least one score")
+    if is_rate and (array == array.flat[0]).all() and array.flat[0] in (0.0, 1.0):
+        num_tasks = array.shape[1]
+        return wilson_interval(round(array.flat[0] * num_tasks), num_tasks, confidence)
+    rng = np.random.default_rng(seed)
+    num_seeds, num_tasks = array.shape
+    # How often each seed and each task is drawn: as good as drawing them, in two products.
+    of_seeds = rng.multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), size=resamples)
+    means = np.empty(resamples)
+    at_once = max(1, _DRAWS_AT_ONCE // num_tasks)
+    for first in range(0, resamples, at_once):
+        chosen = of_seeds[first : first + at_once]
+        of_tasks = rng.multinomial(num_tasks, np.full(num_tasks, 1 / num_tasks), size=len(chosen))
+        means[first : first + at_once] = ((chosen @ array) * of_tasks).sum(axis=1)
+    means /= num_seeds * num_tasks
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+_DRAWS_AT_ONCE = 2**20
+"""Draws of tasks that are held in memory."""
+
+
+def worst_mean(scores: ArrayLike, fraction: float) -> float:
+    """Mean of the lowest `fraction` of the scores [M], at least one: CVaR of the scores.
+
+    Scores that are means of few episodes are noisy, and the lowest are lower than they would be in
+    the long run.
+    """
+    ordered = np.sort(np.asarray(scores, np.float64))
+    count = max(1, math.ceil(fraction * len(ordered) - 1e-9))
+    return float(ordered[:count].mean())
+
+
+def paired_comparison(
+    first: ArrayLike, second: ArrayLike, resamples: int = 9_999, seed: int = 0
+) -> dict[str, Any]:
+    """Compare two agents on the same M tasks.
+
+    Args:
+        first: [M] mean score of one agent on each task.
+        second: [M] of the other.
+        resamples: of the permutation test and of the bootstrap.
+        seed: of the random draws.
+
+    Returns:
+        `difference`, the mean of first - second; its `ci95` over tasks (percentile bootstrap); and
+        `p_value`, two-sided, of the test that exchanges the two agents task by task. With a single
+        task there is no interval and no test: None.
+    """
+    from scipy import stats
+
+    differences = np.asarray(first, np.float64) - np.asarray(second, np.float64)
+    result: dict[str, Any] = {"difference": float(differences.mean())}
+    if len(differences) < 2:
+        return {**result, "ci95": None, "p_value": None}
+    zeros = np.zeros_like(differences)
+    test = stats.permutation_test(
+        (differences, zeros),
+        lambda x, y, axis: np.mean(x - y, axis=axis),
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=resamples,
+        batch=max(1, _DRAWS_AT_ONCE // len(differences)),
+        rng=np.random.default_rng(seed),
+    )
+    interval = clustered_interval(differences[None], seed=seed)
+    return {**result, "ci95": list(interval), "p_value": float(test.pvalue)}

@@ -22,7 +22,7 @@ from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
 from sqn_jax.outside.messages import one_line
 from sqn_jax.outside.reading import read_at_most, read_json
-from sqn_jax.policies.run_policies import Policy, load_policy, require_finite
+from sqn_jax.policies.run_policies import Policy, WhichParams, load_policy, require_finite
 from sqn_jax.storage.files import write_json, write_whole
 from sqn_jax.training.state import params_shapes
 
@@ -36,20 +36,25 @@ MAX_HEADER_BYTES = 2**12
 """Size of what stands before the numbers of an array, at most."""
 
 
-def find_policy(name: str, checkpoint: int | str = "newest") -> Policy:
+def find_policy(
+    name: str, checkpoint: int | str = "newest", params: WhichParams = "shipped"
+) -> Policy:
     """A policy by the name a user gives: a run folder, `pretrained:NAME`, or a file NAME.npz.
 
     Args:
         name: as the user gives it.
         checkpoint: of a run, see `run_policies.load_policy`; other policies have but one.
+        params: the same.
 
     Raises:
         ValueError: there is none, or it is damaged.
     """
     if names_a_run(name):
-        return load_policy(Path(name), checkpoint)
+        return load_policy(Path(name), checkpoint, params)
     if checkpoint != "newest":
         raise ValueError(f"{name}: has no checkpoint {checkpoint}, expected newest")
+    if params != "shipped":
+        raise ValueError(f"{name}: has no {params} parameters, expected shipped")
     if name.startswith(PREFIX):
         return load_pretrained(name.removeprefix(PREFIX))
     path = Path(name)

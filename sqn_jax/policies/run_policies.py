@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,11 @@ from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin, leaves_of
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
 from sqn_jax.training.state import RunnerState, params_shapes
+
+WhichParams = Literal["shipped", "latest", "average", "target"]
+"""Which parameters of a run act: those that it ships (the average where it keeps one, else the
+latest), the latest, the average of `TrainConfig.averages_params`, or those of the target network of
+the method `r2d2`."""
 
 
 @dataclass(frozen=True)
@@ -36,28 +42,42 @@ class Policy:
         return tuple(self.config.seed + index for index in range(self.config.num_seeds))
 
 
-def load_policy(run_dir: Path, checkpoint: int | str = "newest") -> Policy:
+def load_policy(
+    run_dir: Path, checkpoint: int | str = "newest", params: WhichParams = "shipped"
+) -> Policy:
     """Read a policy from a checkpoint of a run folder.
 
     Args:
         run_dir: the folder.
         checkpoint: "newest", "best" (by success in training, over the chunks since the one before)
             or the number of chunks it was saved after.
+        params: which parameters.
 
     Raises:
-        ValueError: it is no run folder, its config is unusable, or it holds no such checkpoint, or
-            a damaged one.
+        ValueError: the run keeps no such parameters, it is no run folder, its config is unusable,
+            or it holds no such checkpoint, or a damaged one.
         Mismatch: the checkpoint is of another run than the config says.
     """
     _, config = RunFolder.open(run_dir)
     if not (run_dir / CHECKPOINTS).is_dir():
         raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")
     with Checkpoints(run_dir, Origin(config)) as checkpoints:
-        params = checkpoints.restore_policy(
-            params_shapes(config), averaged=config.averages_params, which=checkpoint
+        restored = checkpoints.restore_policy(
+            params_shapes(config), averaged=_is_averaged(params, config), which=checkpoint
         )
-    require_finite(params, f"run folder {run_dir}")
-    return Policy(run_dir.resolve().name, config, seeds_of(params, config))
+    require_finite(restored, f"run folder {run_dir}")
+    return Policy(run_dir.resolve().name, config, seeds_of(restored, config))
+
+
+def _is_averaged(params: WhichParams, config: TrainConfig) -> bool:
+    """Whether the parameters are those that follow the latest ones slowly."""
+    if params == "average" and not config.averages_params:
+        raise ValueError(
+            "--params average: this run keeps none (learner.average_share of the method pqn)"
+        )
+    if params == "target" and config.method != "r2d2":
+        raise ValueError(f"--params target: a run of the method {config.method} has no target")
+    return params in ("average", "target") or (params == "shipped" and config.averages_params)
 
 
 def require_finite(params: Params, source: str) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sqn_jax.evaluation.agents import Agent
 from sqn_jax.evaluation.compare import (
+    RECORD_BYTES,
     OnEvaluated,
     evaluate_agents,
     load_maps,
@@ -15,9 +17,13 @@ from sqn_jax.evaluation.compare import (
     num_episodes,
 )
 from sqn_jax.evaluation.settings import Settings
+from sqn_jax.evaluation.suites import SuiteMaps, SuiteSettings, evaluate_suite, robot_for
+from sqn_jax.evaluation.suites import num_episodes as num_suite_episodes
+from sqn_jax.maps import load_map
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import write_json, write_records
+from sqn_jax.tasks import TaskSuite, check_tasks
 from sqn_jax.training import memory_budget
 
 
@@ -26,7 +32,7 @@ def evaluate_session(
     agents: Sequence[Agent],
     settings: Settings,
     out: Path | None = None,
-    on_evaluated: OnEvaluated = lambda batch: None,
+    on_evaluated: OnEvaluated | None = None,
     fields: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Evaluate agents with a progress bar.
@@ -52,6 +58,46 @@ def evaluate_session(
         evaluation, records = evaluate_agents(
             agents, maps, settings, bar.update, on_evaluated, fields
         )
+    if out is not None:
+        write_json(out, evaluation)
+        write_records(out.with_suffix(".jsonl"), records)
+    return evaluation
+
+
+@cached_programs()
+def evaluate_suite_session(
+    agents: Sequence[Agent],
+    suite: TaskSuite,
+    settings: SuiteSettings,
+    out: Path | None = None,
+    source: Path | None = None,
+) -> dict[str, Any]:
+    """Evaluate agents on a suite of tasks with a progress bar.
+
+    Args:
+        agents: see `suites.evaluate_suite`.
+        suite: the tasks; whether they can be solved is checked first.
+        settings: how often each task is tried.
+        out: the JSON file to write; the records of the episodes go beside it, as JSON lines.
+        source: the file of the suite, for errors.
+
+    Returns:
+        The contents of the evaluation file.
+
+    Raises:
+        ValueError: a map is unusable, a task cannot be solved, or the episodes do not fit into
+            memory; nothing has been run.
+    """
+    episodes = num_suite_episodes(agents, suite, settings)
+    memory_budget.require(RECORD_BYTES * episodes, "keeping the episodes", "evaluate")
+    radii = {robot_for(agent.env_config, suite).robot_radius for agent in agents}
+    maps = {radius: SuiteMaps(partial(load_map, robot_radius=radius)) for radius in radii}
+    for radius in radii:
+        check_tasks(
+            suite, maps[radius], robot_radius=radius, source=str(source) if source else None
+        )
+    with episodes_bar(episodes) as bar:
+        evaluation, records = evaluate_suite(agents, suite, maps, settings, bar.update)
     if out is not None:
         write_json(out, evaluation)
         write_records(out.with_suffix(".jsonl"), records)

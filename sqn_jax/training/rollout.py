@@ -208,7 +208,12 @@ class EpisodeMetrics:
     """m traveled up to the first entry, or in the whole episode for a failure."""
 
 
-def episode_metrics(trajectory: Trajectory, goal_radius: Array) -> EpisodeMetrics:
+def episode_metrics(
+    trajectory: Trajectory,
+    goal_radius: Array,
+    max_steps: Array | None = None,
+    collision_ends: Array | None = None,
+) -> EpisodeMetrics:
     """Reduce whole episodes to one number each.
 
     Success counts from the first step on; a robot that starts within the radius has it at step 1
@@ -216,21 +221,33 @@ def episode_metrics(trajectory: Trajectory, goal_radius: Array) -> EpisodeMetric
 
     Args:
         trajectory: with `rewards`, `poses` and `info`.
-        goal_radius: m.
+        goal_radius: m, one number or [N].
+        max_steps: [N] steps of each episode, at most T; None: T.
+        collision_ends: bool, whether nothing counts after the first refused move; None: no.
     """
     info = trajectory.info
-    length = trajectory.rewards.shape[0]
-    inside = info["goal_distance"] < goal_radius
+    length, num_robots = trajectory.rewards.shape
+    is_cut = max_steps is not None
+    limit = jnp.full(num_robots, length) if max_steps is None else max_steps
+    end = limit
+    if collision_ends is not None:
+        first_collision = jnp.argmax(info["collision"], axis=0) + 1
+        ended = collision_ends & info["collision"].any(axis=0)
+        end = jnp.where(ended, jnp.minimum(limit, first_collision), limit)
+    steps = jnp.arange(length)[:, None]
+    within = steps < end[None]
+    radii = jnp.broadcast_to(goal_radius, num_robots)[None]
+    inside = (info["goal_distance"] < radii) & within
     success = inside.any(axis=0)
-    time_steps = jnp.where(success, jnp.argmax(inside, axis=0) + 1, length).astype(jnp.int32)
+    time_steps = jnp.where(success, jnp.argmax(inside, axis=0) + 1, limit).astype(jnp.int32)
     moves = jnp.diff(trajectory.poses[..., :2], axis=0)
     traveled = jnp.hypot(moves[..., 0], moves[..., 1])
-    counted = jnp.arange(length)[:, None] < time_steps[None]
+    counted = within & (steps < time_steps[None])
     return EpisodeMetrics(
         success=success,
         time_steps=time_steps,
-        mean_reward=trajectory.rewards.mean(axis=0),
-        collisions=info["collision"].sum(axis=0, dtype=jnp.int32),
-        covered_area=info["covered_area"].sum(axis=0),
+        mean_reward=jnp.mean(trajectory.rewards, axis=0, where=within if is_cut else None),
+        collisions=(info["collision"] & within).sum(axis=0, dtype=jnp.int32),
+        covered_area=jnp.where(within, info["covered_area"], 0.0).sum(axis=0),
         path_length=jnp.where(counted, traveled, 0.0).sum(axis=0),
     )

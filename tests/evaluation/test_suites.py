@@ -1,0 +1,292 @@
+"""Suites of given tasks: episodes as on each map alone, judged by the limits of each task."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import random_params
+
+from sqn_jax.agent import make_network
+from sqn_jax.agent.networks import initial_carry
+from sqn_jax.agent.trajectory import Trajectory
+from sqn_jax.cli import main
+from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.env import EnvParams, make_env, reset_to, step
+from sqn_jax.evaluation import episodes, suite_scores, suites
+from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
+from sqn_jax.maps import OccupancyMap
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.tasks import Task, TaskSuite
+from sqn_jax.training.rollout import episode_metrics
+
+LENGTH = 24
+NETWORK = NetworkConfig(hidden_size=16)
+
+
+def room(name: str, rows: int, cols: int, resolution: float, origin: Any) -> OccupancyMap:
+    """An empty room of any size, cells and frame."""
+    occupied = np.zeros((rows, cols), bool)
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    width, height = cols * resolution, rows * resolution
+    points = np.array([[0.6, 0.6], [width - 0.6, height - 0.6]])
+    return OccupancyMap(name, occupied, resolution, points, points, origin)
+
+
+ROOMS = {
+    "wide": room("wide", 30, 50, 0.1, (-2.0, 1.0, 0.0)),
+    "turned": room("turned", 60, 40, 0.05, (0.5, -3.0, 0.7)),
+    "coarse": room("coarse", 12, 14, 0.25, (0.0, 0.0, 0.0)),
+}
+
+
+def task(name: str, start: Any, goal: Any, heading: float | None = None, **changes: Any) -> Task:
+    """A task by places in the grid's frame."""
+    there = ROOMS[name].to_map_frame([start, goal])
+    turned = None if heading is None else heading + ROOMS[name].origin[2]
+    given = Task(name, tuple(there[0]), turned, tuple(there[1]), LENGTH, 0.3, None)
+    return dataclasses.replace(given, **changes)
+
+
+TASKS = (
+    task("wide", (0.75, 0.75), (4.2, 2.2)),
+    task("turned", (1.01, 1.52), (1.5, 0.6), heading=3.0),
+    task("coarse", (1.6, 1.4), (1.6, 2.0), heading=-1.5, goal_radius=0.7, max_steps=10),
+    task("wide", (4.2, 2.2), (0.75, 0.75)),
+)
+SUITE = TaskSuite("rooms", TASKS)
+SETTINGS = suites.SuiteSettings(episodes=2, eval_seeds=2)
+
+
+def agent(num_seeds: int = 1) -> TrainedAgent:
+    config = TrainConfig(algo="sqn", network=NETWORK, num_seeds=num_seeds)
+    world = make_env(ROOMS["wide"], config.env)
+    network = make_network("sqn", NETWORK, 5)
+    params = tuple(random_params(network, world, seed) for seed in range(num_seeds))
+    return TrainedAgent("sqn", (Policy("rooms", config, params),))
+
+
+@pytest.fixture(scope="module")
+def chunk() -> suites.SuiteChunk:
+    robot = suites.robot_for(EnvConfig(), SUITE)
+    (chunk,) = suites.chunks(SUITE, robot, ROOMS.__getitem__)
+    return chunk
+
+
+def run(chunk: suites.SuiteChunk, policies: TrainedAgent, chosen: Any = slice(None)) -> Any:
+    keys = suites._keys(jnp.asarray(chunk.numbers), SETTINGS)[chosen]
+    tasks = jax.tree.map(lambda x: x[chosen], chunk.repeated(SETTINGS.tries))
+    fields = ("poses", "actions", "rewards", "info")
+    return episodes.run_seeds(
+        keys,
+        policies.stacked_params(),
+        chunk.joined,
+        policies.network,
+        tasks=tasks,
+        fields=fields,
+    )
+
+
+def alone(world: EnvParams, start: Any, goal: Any, policies: TrainedAgent) -> Any:
+    """An episode of one robot on its own map: a loop over `step`, no batch and no other map."""
+    params, network = policies.policies[0].params[0], policies.network
+    obs, state = reset_to(jax.random.key(0), start, goal, world)
+
+    def act(carried: Any, _: Any) -> Any:
+        obs, state, carry = carried
+        carry, output = network.apply(params, jax.tree.map(lambda x: x[None, None], obs), carry)
+        action = output.q_values[0, 0].argmax()
+        obs, state, *_ = step(jax.random.key(0), state, action, world)
+        return (obs, state, carry), (action, state.pose)
+
+    first = obs, state, initial_carry(network.config, 1)
+    return jax.lax.scan(act, first, None, length=LENGTH)[1]
+
+
+def test_each_robot_moves_as_on_its_own_map_alone(chunk: suites.SuiteChunk) -> None:
+    assert len({(m.resolution, m.shape) for m in chunk.maps}) == 3
+    policies = agent()
+    (together,) = run(chunk, policies)
+    compiled = jax.jit(functools.partial(alone, policies=policies))
+    which = np.asarray(chunk.repeated(SETTINGS.tries).maps)
+    for index in range(0, len(together.goals), SETTINGS.tries):
+        world = chunk.worlds[which[index]]
+        actions, poses = compiled(world, together.starts[index], together.goals[index])
+        np.testing.assert_array_equal(actions, together.trajectory.actions[:, index])
+        np.testing.assert_allclose(poses, together.trajectory.poses[1:, index], atol=2e-5)
+        assert len(np.unique(actions)) > 1
+
+
+def test_an_episode_is_the_same_bit_for_bit_without_the_others(chunk: suites.SuiteChunk) -> None:
+    (together,) = run(chunk, agent())
+    chosen = slice(5, 7)
+    (few,) = run(chunk, agent(), chosen)
+    ours, theirs = together.of_episodes(chosen), few
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_several_policies_in_one_call_run_as_each_alone(chunk: suites.SuiteChunk) -> None:
+    both = agent(2)
+    results = run(chunk, both)
+    for result, params in zip(results, both.policies[0].params, strict=True):
+        policy = dataclasses.replace(both.policies[0], params=(params,))
+        (own,) = run(chunk, dataclasses.replace(both, policies=(policy,)))
+        for one, other in zip(jax.tree.leaves(result), jax.tree.leaves(own), strict=True):
+            np.testing.assert_array_equal(one, other)
+    first, second = results
+    assert (first.trajectory.actions != second.trajectory.actions).any()
+
+
+def test_starts_and_goals_are_those_of_the_file_in_the_frame_of_the_grid(
+    chunk: suites.SuiteChunk,
+) -> None:
+    (result,) = run(chunk, agent())
+    of_tasks = dict(zip(chunk.numbers.tolist(), range(len(TASKS)), strict=True))
+    by_hand = {0: (0.75, 0.75), 1: (1.01, 1.52), 2: (1.6, 1.4), 3: (4.2, 2.2)}
+    for number, place in by_hand.items():
+        tries = slice(of_tasks[number] * SETTINGS.tries, (of_tasks[number] + 1) * SETTINGS.tries)
+        np.testing.assert_allclose(result.starts[tries, :2], np.tile(place, (4, 1)), atol=1e-6)
+        headings = result.starts[tries, 2]
+        if TASKS[number].heading is None:
+            assert len(np.unique(headings)) == SETTINGS.tries, "drawn anew for each episode"
+        else:
+            turned = {1: 3.0, 2: -1.5}[number]
+            np.testing.assert_allclose(headings, turned, atol=1e-6)
+
+
+def reference_metrics(
+    distances: Any, refused: Any, rewards: Any, radius: float, limit: int, ends: bool
+) -> tuple[bool, int, int, float]:
+    """One episode, step by step: success, steps, collisions, mean reward."""
+    collisions, total = 0, 0.0
+    success, steps, taken = False, limit, 0
+    for index in range(limit):
+        taken += 1
+        total += rewards[index]
+        collisions += int(refused[index])
+        if distances[index] < radius and not success:
+            success, steps = True, index + 1
+        if ends and refused[index]:
+            break
+    return success, steps, collisions, total / taken
+
+
+@pytest.mark.parametrize("collision_ends", [False, True])
+def test_each_episode_is_judged_by_its_own_limits(collision_ends: bool) -> None:
+    rng = np.random.default_rng(3)
+    steps, robots = 30, 200
+    distances = rng.uniform(0, 3, (steps, robots)).astype(np.float32)
+    refused = rng.uniform(size=(steps, robots)) < 0.05
+    rewards = rng.normal(size=(steps, robots)).astype(np.float32)
+    limits = rng.integers(1, steps + 1, robots)
+    radii = rng.uniform(0.05, 0.4, robots).astype(np.float32)
+    info = {
+        "goal_distance": jnp.asarray(distances),
+        "collision": jnp.asarray(refused),
+        "covered_area": jnp.zeros((steps, robots)),
+    }
+    trajectory = Trajectory(
+        rewards=jnp.asarray(rewards), poses=jnp.zeros((steps + 1, robots, 3)), info=info
+    )
+    metrics = episode_metrics(
+        trajectory, jnp.asarray(radii), jnp.asarray(limits), jnp.bool_(collision_ends)
+    )
+    for robot in range(robots):
+        success, taken, collisions, reward = reference_metrics(
+            distances[:, robot],
+            refused[:, robot],
+            rewards[:, robot],
+            radii[robot],
+            limits[robot],
+            collision_ends,
+        )
+        assert metrics.success[robot] == success
+        assert metrics.time_steps[robot] == taken
+        assert metrics.collisions[robot] == collisions
+        assert metrics.mean_reward[robot] == pytest.approx(reward, abs=1e-5)
+    assert 20 < int(metrics.success.sum()) < 180
+
+
+@pytest.fixture(scope="module")
+def evaluated() -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """An untrained policy, greedy and at random, and both baselines."""
+    policy = agent()
+    agents = [
+        policy,
+        dataclasses.replace(policy, name="random", epsilon=1.0),
+        BaselineAgent("bug", EnvConfig()),
+        BaselineAgent("oracle", EnvConfig()),
+    ]
+    maps = {EnvConfig().robot_radius: ROOMS.__getitem__}
+    return suites.evaluate_suite(agents, SUITE, maps, SETTINGS)
+
+
+def test_the_oracle_arrives_on_every_map(evaluated: Any) -> None:
+    of_agents = {entry["agent"]: entry for entry in evaluated[0]["results"]}
+    assert of_agents["oracle"]["success"]["mean"] == 1.0
+    assert of_agents["oracle"]["worst_tenth"] == 1.0
+    assert of_agents["oracle"]["spl"]["mean"] > 0.9
+    assert [entry["map"] for entry in of_agents["bug"]["maps"]] == ["wide", "turned", "coarse"]
+
+
+def test_the_numbers_are_means_of_the_records(evaluated: Any) -> None:
+    contents, records = evaluated
+    assert len(records) == 4 * len(TASKS) * SETTINGS.tries
+    for entry in contents["results"]:
+        own = [record for record in records if record["agent"] == entry["agent"]]
+        for name in suite_scores.METRICS:
+            mean = np.mean([record[name] for record in own])
+            assert entry[name]["mean"] == pytest.approx(mean), name
+        for number, of_task in enumerate(entry["tasks"]):
+            rates = [record["success"] for record in own if record["task"] == number]
+            assert of_task["success"] == pytest.approx(np.mean(rates))
+    json.dumps(contents, allow_nan=False)
+
+
+def test_the_length_of_the_shortest_path_is_the_straight_line_in_an_empty_room(
+    evaluated: Any,
+) -> None:
+    lengths = {record["task"]: record["shortest_path_m"] for record in evaluated[1]}
+    for number, given in enumerate(TASKS):
+        straight = np.hypot(*np.subtract(given.goal, given.start))
+        assert straight * 0.98 < lengths[number] < straight * 1.03 + 0.05
+
+
+def test_failures_take_the_limit_of_their_task(evaluated: Any) -> None:
+    for record in evaluated[1]:
+        assert record["time_steps"] <= TASKS[record["task"]].max_steps
+        if not record["success"]:
+            assert record["time_steps"] == TASKS[record["task"]].max_steps
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--maps", "maze"], "--maps: not with --tasks"),
+        (["--goal-radius", "1"], "--goal-radius: not with --tasks"),
+        (["--max-steps", "3"], "--max-steps: not with --tasks"),
+        (["--velocity-noise", "0.1", "0.2"], "2 levels, expected one"),
+        ([], "tasks[0].start (0, 0) lies in an obstacle on map maze"),
+        (["--epsilon", "1.5"], "epsilon is 1.5, expected 0 to 1"),
+        (["--epsilon", "0", "0"], "epsilon: 0.0 comes twice"),
+        (["--params", "target"], "has no target parameters"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "suite.json"
+    in_a_wall = {"map": "maze", "start": [0, 0], "goal": [2, 2]}
+    file.write_text(json.dumps({"schema": 1, "name": "wall", "tasks": [in_a_wall]}))
+    assert main(["evaluate", "pretrained:dqn", "--tasks", str(file), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
