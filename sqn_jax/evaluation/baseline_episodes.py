@@ -24,7 +24,6 @@ from sqn_jax.env.several_maps import select_maps
 from sqn_jax.evaluation.episodes import (
     EpisodeResults,
     GivenTasks,
-    judged,
     metrics_of,
     start_by_hand,
     step_by_hand,
@@ -119,11 +118,9 @@ def run_on_tasks(
         collision_ends: whether a refused move makes a task fail.
     """
     trajectory = _run(keys, choose, select_maps(env_params, tasks.maps), (), tasks)
-    stacked = jax.tree.map(lambda x: x[None], judged(trajectory))
-    metrics = task_metrics(stacked, tasks, jnp.bool_(collision_ends))
-    on_host = jax.tree.map(lambda x: np.asarray(x[0]), metrics)
+    metrics = task_metrics(trajectory, tasks, collision_ends=collision_ends)
     starts, goals = jax.device_get((trajectory.poses[0], trajectory.goals))
-    return EpisodeResults([on_host], starts, goals, Trajectory())
+    return EpisodeResults([metrics], starts, goals, Trajectory())
 
 
 def _run(

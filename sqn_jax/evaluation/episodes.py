@@ -155,16 +155,15 @@ def run_seeds(
         chosen = first + jnp.arange(BATCH) % count  # The rest of a batch is padding.
         of_batch = None if tasks is None else jax.tree.map(lambda x, i=chosen: x[i], tasks)
         trajectory = _run_batch(keys[chosen], params, env_params, network, epsilon, of_batch)
-        if of_batch is None:
-            metrics = [_metrics(judged(trajectory), jnp.float32(radius)) for radius in radii]
-        else:
-            metrics = [task_metrics(judged(trajectory), of_batch, jnp.bool_(collision_ends))]
-        ends = trajectory.poses[:, 0], trajectory.goals
-        of_policies = jax.device_get((metrics, *ends, trajectory.only(*fields)))
-        results = [
-            EpisodeResults(*jax.tree.map(lambda x, i=index: x[i], of_policies))
-            for index in range(num_policies)
-        ]
+        results = []
+        for index in range(num_policies):
+            own = jax.tree.map(lambda x, i=index: x[i], trajectory)
+            if of_batch is None:
+                metrics = metrics_of(own, radii)
+            else:
+                metrics = [task_metrics(own, of_batch, collision_ends=collision_ends)]
+            ends = jax.device_get((own.poses[0], own.goals, own.only(*fields)))
+            results.append(EpisodeResults(metrics, *ends))
         batches.append([result.of_episodes(slice(count)) for result in results])
         on_batch(num_policies * count)
     return [join_results(results) for results in zip(*batches, strict=True)]
@@ -235,27 +234,30 @@ def _run_batch(
 
 
 def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
-    """`episode_metrics` of one policy for each radius, m; NumPy arrays [E]."""
-    stacked = jax.tree.map(lambda x: x[None], judged(trajectory))
-    metrics = jax.device_get([_metrics(stacked, jnp.float32(radius)) for radius in goal_radii])
-    on_host: list[EpisodeMetrics] = jax.tree.map(lambda x: x[0], metrics)
+    """`episode_metrics` for each radius, m; NumPy arrays [E].
+
+    A program of its own, so that the program of the episodes is the same for all radii.
+    """
+    judged = trajectory.only("rewards", "poses", "info")
+    on_host: list[EpisodeMetrics] = jax.device_get(
+        [_metrics(judged, jnp.float32(radius)) for radius in goal_radii]
+    )
     return on_host
 
 
-def judged(trajectory: Trajectory) -> Trajectory:
-    """The part of a trajectory that decides the metrics."""
-    return trajectory.only("rewards", "poses", "info")
+def task_metrics(
+    trajectory: Trajectory, tasks: GivenTasks, *, collision_ends: bool
+) -> EpisodeMetrics:
+    """`episode_metrics` by the limits of each task; NumPy arrays [E]."""
+    judged = trajectory.only("rewards", "poses", "info")
+    ends = jnp.bool_(collision_ends)
+    on_host: EpisodeMetrics = jax.device_get(
+        _metrics(judged, tasks.goal_radii, tasks.max_steps, ends)
+    )
+    return on_host
 
 
-# Programs of their own, so that the program of the episodes is the same for all radii.
-_metrics = jax.jit(jax.vmap(episode_metrics, in_axes=(0, None)))
-
-
-@jax.jit
-def task_metrics(trajectory: Trajectory, tasks: GivenTasks, collision_ends: Array) -> Any:
-    """The metrics [S, E] of given tasks, out of trajectories [S, T, E, ...]."""
-    judge = jax.vmap(episode_metrics, in_axes=(0, None, None, None))
-    return judge(trajectory, tasks.goal_radii, tasks.max_steps, collision_ends)
+_metrics = jax.jit(episode_metrics)
 
 
 @jax.jit
