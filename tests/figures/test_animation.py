@@ -366,5 +366,5 @@ def test_a_long_name_is_cut_where_the_words_beside_it_begin(arrival: int) -> Non
     }
     words, name = sorted(boxes)[1], sorted(boxes)[0]
     assert name.startswith("$x_{$yyy")
-    assert name.endswith("y\N{HORIZONTAL ELLIPSIS} on room")
+    assert name.endswith("y\N{HORIZONTAL ELLIPSIS}, room")
     assert 4 < boxes[words].x0 - boxes[name].x1 < 20
