@@ -333,7 +333,7 @@ def test_the_last_frame_says_that_the_goal_was_reached_and_the_first_does_not() 
     words = [text.get_text() for text in screen.figure.texts]
     # At (3, 2) m, 1.4 m from the goal at (4, 1) m.
     assert "step 40 of 60   4.0 s   1.4 m to the goal   reached at step 20" in words
-    assert "tester on room" in words
+    assert "tester, room" in words
     assert (last[:40] == GREEN).all(axis=-1).any()
     assert not (first[:40] == GREEN).all(axis=-1).any()
     assert tuple(screen.draw(0)[22, 700]) == tuple(first[22, 700])
@@ -362,9 +362,9 @@ def test_a_long_name_is_cut_where_the_words_beside_it_begin(arrival: int) -> Non
     boxes = {
         text.get_text(): text.get_window_extent()
         for text in screen.figure.texts
-        if " on room" in text.get_text() or "step 60" in text.get_text()
+        if ", room" in text.get_text() or "step 60" in text.get_text()
     }
     words, name = sorted(boxes)[1], sorted(boxes)[0]
     assert name.startswith("$x_{$yyy")
-    assert name.endswith("y\N{HORIZONTAL ELLIPSIS} on room")
+    assert name.endswith("y\N{HORIZONTAL ELLIPSIS}, room")
     assert 4 < boxes[words].x0 - boxes[name].x1 < 20
