@@ -126,7 +126,7 @@ def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
         seed=options.seed,
         noise=(sum(options.velocity_noise), sum(options.range_noise)),
     )
-    evaluation = evaluate_suite_session(_agents(options), suite, settings, options.out, file)
+    evaluation, _ = evaluate_suite_session(_agents(options), suite, settings, options.out, file)
     say_lines([*suite_table(evaluation).split("\n"), *comparison_lines(evaluation)])
 
 

@@ -71,7 +71,7 @@ def evaluate_suite_session(
     settings: SuiteSettings,
     out: Path | None = None,
     source: Path | None = None,
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Evaluate agents on a suite of tasks with a progress bar.
 
     Args:
@@ -82,7 +82,7 @@ def evaluate_suite_session(
         source: the file of the suite, for errors.
 
     Returns:
-        The contents of the evaluation file.
+        The contents of the evaluation file, and the records of the episodes.
 
     Raises:
         ValueError: a map is unusable, a task cannot be solved, or the episodes do not fit into
@@ -101,4 +101,4 @@ def evaluate_suite_session(
     if out is not None:
         write_json(out, evaluation)
         write_records(out.with_suffix(".jsonl"), records)
-    return evaluation
+    return evaluation, records
