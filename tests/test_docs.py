@@ -283,6 +283,8 @@ def smaller(words: list[str]) -> list[str]:
     kept = []
     if "--resume" in rest:
         del table["--preset"]
+    if "--tasks" in rest and rest[rest.index("--tasks") + 1].endswith(".json"):
+        del table["--maps"], table["--max-steps"]  # The suite says both.
     if command == "train" and "my_map.yaml" in rest:
         table["--map"] = ["--map", "my_map.yaml"]
     while rest:
