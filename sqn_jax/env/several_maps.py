@@ -42,22 +42,31 @@ def join_maps(
     first = worlds[0]
     config = first.config
     return dataclasses.replace(
-        first,
+        without_spawn_points(first),
         sight=_join([world.sight for world in worlds]),
         body=_join([world.body for world in worlds]),
         lattice=Lattice.over(tile_m[1], tile_m[0], config.coverage_cell, config.max_range),
         max_steps=max_steps,
-        spawn_positions=_one_entry(first.spawn_positions),
-        spawn_counts=_one_entry(first.spawn_counts),
-        start_points=_one_entry(first.start_points),
-        spawn_groups=_one_entry(first.spawn_groups),
-        spawn_neighbors=_one_entry(first.spawn_neighbors),
     )
 
 
-def _one_entry(array: Array) -> Array:
-    """What tasks are drawn from differs in shape from map to map, and is not used."""
-    return array[(slice(0, 1),) * array.ndim]
+def without_spawn_points(env_params: EnvParams) -> EnvParams:
+    """The same world without the places that tasks are drawn from, whose shapes differ.
+
+    Episodes that start with `reset_to` share their compiled program then.
+    """
+
+    def one_entry(array: Array) -> Array:
+        return jnp.zeros((1,) * array.ndim, array.dtype)
+
+    return dataclasses.replace(
+        env_params,
+        spawn_positions=one_entry(env_params.spawn_positions),
+        spawn_counts=one_entry(env_params.spawn_counts),
+        start_points=one_entry(env_params.start_points),
+        spawn_groups=one_entry(env_params.spawn_groups),
+        spawn_neighbors=one_entry(env_params.spawn_neighbors),
+    )
 
 
 def _join(grids: Sequence[RayGrid]) -> RayGrid:

@@ -102,7 +102,8 @@ class TrainedAgent:
     def stacked_params(self) -> Params:
         """The parameters of all training seeds, with a leading axis [S]."""
         params_of_seeds = [params for policy in self.policies for params in policy.params]
-        return jax.tree.map(lambda *x: jnp.stack(x), *params_of_seeds)
+        # By NumPy: for each shape of a parameter JAX would compile a program.
+        return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *params_of_seeds)
 
     def run(
         self,

@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork, initial_carry
 from sqn_jax.agent.trajectory import Trajectory, over_robots
-from sqn_jax.env import EnvParams, EnvState, Observation, reset_to
+from sqn_jax.env import EnvParams, EnvState, Observation, reset_to, sample_task
 from sqn_jax.env.randomize import robot_axes
-from sqn_jax.env.several_maps import select_maps
+from sqn_jax.env.several_maps import select_maps, without_spawn_points
 from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
     RandomDraws,
     episode_metrics,
     random_draws,
-    reset_robots,
     step_actors,
     unroll,
 )
@@ -59,8 +58,27 @@ class GivenTasks:
     """[E] m."""
 
 
-def start_episodes(
-    keys: Array, carry: Array, env_params: EnvParams, tasks: GivenTasks | None = None
+@jax.jit
+def draw_tasks(keys: Array, env_params: EnvParams) -> tuple[Array, Array]:
+    """The starts [E, 3] and goals [E, 2] that the episodes of keys [E] have in a world.
+
+    A program of its own, so that the program of the episodes is the same for all kinds of tasks.
+    """
+
+    def draw(key: Array) -> tuple[Array, Array]:
+        task_key, _ = jax.random.split(_start_key(key))
+        return sample_task(task_key, env_params)
+
+    return jax.vmap(draw)(keys)
+
+
+def _start_key(key: Array) -> Array:
+    """Out of the key of an episode that of its task and of the noise of its first scan."""
+    return jax.random.split(jax.random.split(key)[0], 1)[0]
+
+
+def _start_episodes(
+    keys: Array, starts: Array, goals: Array, carry: Array, env_params: EnvParams
 ) -> tuple[RandomDraws, ActorState]:
     """Start the episodes of these keys: the random draws of their steps, and the first state.
 
@@ -69,32 +87,30 @@ def start_episodes(
 
     Args:
         keys: [E] from `episode_keys`.
+        starts: [E, 3] x m, y m, heading rad; a heading that is NaN is drawn.
+        goals: [E, 2] x m, y m.
         carry: [E, H] the initial carry.
         env_params: the world, or that of each robot.
-        tasks: the tasks; None: drawn from the world.
 
     Returns:
-        The random draws [T, E], and the actor state with starts, goals and first observations.
+        The random draws [T, E], and the actor state with the first observations.
     """
 
-    def split(key: Array) -> tuple[Array, RandomDraws]:
-        start_key, draws_key = jax.random.split(key)
-        draws = random_draws(draws_key, env_params.max_steps, 1)
-        return jax.random.split(start_key, 1)[0], jax.tree.map(lambda x: x[:, 0], draws)
+    def draws_of(key: Array) -> RandomDraws:
+        draws = random_draws(jax.random.split(key)[1], env_params.max_steps, 1)
+        return jax.tree.map(lambda x: x[:, 0], draws)
 
     def begin(
         key: Array, start: Array, goal: Array, world: EnvParams
     ) -> tuple[Observation, EnvState]:
-        heading_key, noise_key = jax.random.split(key)
+        heading_key, noise_key = jax.random.split(_start_key(key))
         drawn = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
         heading = jnp.where(jnp.isnan(start[2]), drawn, start[2])
         return reset_to(noise_key, start.at[2].set(heading), goal, world)
 
-    start_keys, draws = jax.vmap(split, out_axes=(0, 1))(keys)
-    if tasks is None:
-        return draws, ActorState(*reset_robots(start_keys, env_params), carry)
+    draws = jax.vmap(draws_of, out_axes=1)(keys)
     begin_all = jax.vmap(begin, in_axes=(0, 0, 0, robot_axes(env_params)))
-    obs, env_state = begin_all(start_keys, tasks.starts, tasks.goals, env_params)
+    obs, env_state = begin_all(keys, starts, goals, env_params)
     return draws, ActorState(obs, env_state, carry)
 
 
@@ -148,24 +164,29 @@ def run_seeds(
         The results of each policy.
     """
     radii = goal_radii or [float(env_params.goal_radius)]
-    num_policies = len(jax.tree.leaves(params)[0])
+    world = without_spawn_points(env_params)
     batches = []
     for first in range(0, len(keys), BATCH):
         count = min(BATCH, len(keys) - first)
-        chosen = first + jnp.arange(BATCH) % count  # The rest of a batch is padding.
-        of_batch = None if tasks is None else jax.tree.map(lambda x, i=chosen: x[i], tasks)
-        trajectory = _run_batch(keys[chosen], params, env_params, network, epsilon, of_batch)
+        chosen = first + np.arange(BATCH) % count  # The rest of a batch is padding.
+        own_keys, own_tasks = keys[chosen], jax.tree.map(lambda x, i=chosen: x[i], tasks)
+        if own_tasks is None:
+            places = draw_tasks(own_keys, env_params)
+        else:
+            places = own_tasks.starts, own_tasks.goals
+        maps = None if own_tasks is None else own_tasks.maps
         results = []
-        for index in range(num_policies):
-            own = jax.tree.map(lambda x, i=index: x[i], trajectory)
-            if of_batch is None:
-                metrics = metrics_of(own, radii)
+        for trajectory, starts in _run_batch(
+            own_keys, *places, maps, params, world, network, epsilon
+        ):
+            if own_tasks is None:
+                metrics = metrics_of(trajectory, radii)
             else:
-                metrics = [task_metrics(own, of_batch, collision_ends=collision_ends)]
-            ends = jax.device_get((own.poses[0], own.goals, own.only(*fields)))
-            results.append(EpisodeResults(metrics, *ends))
-        batches.append([result.of_episodes(slice(count)) for result in results])
-        on_batch(num_policies * count)
+                metrics = [task_metrics(trajectory, own_tasks, collision_ends=collision_ends)]
+            ends = jax.device_get((starts, places[1], trajectory.only(*fields)))
+            results.append(EpisodeResults(metrics, *ends).of_episodes(slice(count)))
+        batches.append(results)
+        on_batch(len(results) * count)
     return [join_results(results) for results in zip(*batches, strict=True)]
 
 
@@ -202,7 +223,7 @@ def run_episodes(
     Returns:
         The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
     """
-    stacked = jax.tree.map(lambda x: x[None], params)
+    stacked = jax.tree.map(lambda x: np.asarray(x)[None], params)
     (results,) = run_seeds(keys, stacked, env_params, network, fields=fields, **options)
     return results.metrics, results.trajectory
 
@@ -210,27 +231,32 @@ def run_episodes(
 @partial(jax.jit, static_argnames="network")
 def _run_batch(
     keys: Array,
+    starts: Array,
+    goals: Array,
+    maps: Array | None,
     params: Params,
-    env_params: EnvParams,
+    world: EnvParams,
     network: QNetwork,
     epsilon: float,
-    tasks: GivenTasks | None,
-) -> Trajectory:
-    """Trajectories [S, T, E, ...] of policies [S]."""
-    if tasks is not None:
-        env_params = select_maps(env_params, tasks.maps)
+) -> list[tuple[Trajectory, Array]]:
+    """For each policy of params [S, ...] the trajectory of E robots and their starts [E, 3]."""
+    if maps is not None:
+        world = select_maps(world, maps)
     carry = initial_carry(network.config, len(keys))
-    draws, actors = start_episodes(keys, carry, env_params, tasks)
+    draws, actors = _start_episodes(keys, starts, goals, carry, world)
     epsilons = jnp.full(len(keys), epsilon, jnp.float32)
 
     def run(params: Params) -> Trajectory:
-        return unroll(draws, params, actors, epsilons, env_params, network)[1]
+        return unroll(draws, params, actors, epsilons, world, network)[1]
 
-    if len(jax.tree.leaves(params)[0]) == 1:
+    num_policies = len(jax.tree.leaves(params)[0])
+    if num_policies == 1:
         # An axis of one would only be in the compiler's way.
-        alone = run(jax.tree.map(lambda x: x[0], params))
-        return jax.tree.map(lambda x: x[None], alone)
-    return jax.vmap(run)(params)
+        trajectories = [run(jax.tree.map(lambda x: x[0], params))]
+    else:
+        stacked = jax.vmap(run)(params)
+        trajectories = [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(num_policies)]
+    return [(trajectory, trajectory.poses[0]) for trajectory in trajectories]
 
 
 def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[EpisodeMetrics]:
@@ -260,7 +286,6 @@ def task_metrics(
 _metrics = jax.jit(episode_metrics)
 
 
-@jax.jit
 def start_by_hand(
     keys: Array, env_params: EnvParams, tasks: GivenTasks | None = None
 ) -> tuple[Array, ActorState]:
@@ -274,7 +299,19 @@ def start_by_hand(
     Returns:
         The keys [T, E] for `step_by_hand`, and the actor state, whose carry is empty [E, 0].
     """
-    draws, actors = start_episodes(keys, jnp.zeros((len(keys), 0)), env_params, tasks)
+    if tasks is None:
+        starts, goals = draw_tasks(keys, env_params)
+    else:
+        starts, goals = tasks.starts, tasks.goals
+    return _start_by_hand(keys, starts, goals, without_spawn_points(env_params))
+
+
+@jax.jit
+def _start_by_hand(
+    keys: Array, starts: Array, goals: Array, world: EnvParams
+) -> tuple[Array, ActorState]:
+    carry = jnp.zeros((len(keys), 0))
+    draws, actors = _start_episodes(keys, starts, goals, carry, world)
     return draws.step_keys, actors
 
 
