@@ -44,6 +44,12 @@ def evaluate(arguments: list[str]) -> int:
         default=0,
         help="steps per episode (default: each map's limit)",
     )
+    add(
+        "--robot-radius",
+        type=float,
+        metavar="M",
+        help="m; the radius of all robots (default: as trained)",
+    )
     add("--goal-radius", nargs="+", type=float, default=[0.3, 0.5], metavar="M", help="m")
     add("--no-references", action="store_true", help="leave out the oracle and the wall follower")
     add_checkpoint(parser)
@@ -72,6 +78,7 @@ def evaluate(arguments: list[str]) -> int:
         noise_unit=options.noise_unit,
         goal_radii=tuple(options.goal_radius),
         max_steps=options.max_steps,
+        robot_radius=options.robot_radius,
     )
     if options.out is not None:
         _require_writable(options.out)

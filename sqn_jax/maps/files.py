@@ -16,6 +16,13 @@ def one_line(reason: object) -> str:
     return " ".join("".join(shown).split())
 
 
+def no_file(path: Path) -> str:
+    """What stands in the place of a file that is none: nothing, a folder, or a pipe, say."""
+    if path.is_dir():
+        return "a folder"
+    return "not a regular file" if path.exists() else "no such file"
+
+
 def read_at_most(path: Path, limit: int, expected: str) -> bytes:
     """The contents of a regular file of at most `limit` bytes; a larger one is not read.
 
@@ -29,7 +36,7 @@ def read_at_most(path: Path, limit: int, expected: str) -> bytes:
     """
     try:
         if not path.is_file():
-            raise ValueError(f"{named(path)}: no such file, expected {expected}")
+            raise ValueError(f"{named(path)}: {no_file(path)}, expected {expected}")
         size = path.stat().st_size
         if size > limit:
             raise ValueError(f"{named(path)}: larger than {limit} bytes, expected {expected}")
