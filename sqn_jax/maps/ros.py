@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+import os
 import re
 import reprlib
 import warnings
@@ -116,7 +117,7 @@ def load_map_file(
         validate(loaded, robot_radius, source=named(path))
         return loaded
     if path.suffix.lower() not in (".yaml", ".yml"):
-        if path.is_dir():
+        if os.path.isdir(path):  # False for what is no possible name.
             raise ValueError(
                 f"{named(path)}: a folder, expected a .yaml or .map file{_inside(path)}"
             )

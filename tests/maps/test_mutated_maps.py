@@ -50,7 +50,8 @@ def assert_usable(loaded: OccupancyMap, robot_radius: float) -> None:
         assert (points > 0).all()
         assert (points < (cols * loaded.resolution, rows * loaded.resolution)).all()
         assert np.isfinite(loaded.to_map_frame(points)).all()
-    assert max(map(abs, loaded.origin)) <= MAX_PLACE
+    # The origin of the file, but for a wall or what was cut off.
+    assert max(map(abs, loaded.origin)) <= MAX_PLACE + sum(loaded.size_m)
     assert 0 <= loaded.spawn_radius <= MAX_PLACE
     assert isinstance(loaded.max_steps, int)
     assert 1 <= loaded.max_steps <= 1_000_000

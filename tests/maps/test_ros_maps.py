@@ -278,8 +278,127 @@ def test_ordinary_maps_are_not_warned_about(
     assert load_map(room(grey=blocks(*greys), free_thresh=free_thresh)).warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("greys", "free_thresh"),
+    [
+        ((254,) * 9 + (255,), "0.1"),  # a shade of white beside a purer one
+        ((254, 254, 240), "0.25"),  # far lighter than any gray for unknown
+        ((205, 205, 205, 205, 254), "0.25"),  # what is left would be a nook
+    ],
+)
+def test_no_warning_gives_advice_that_makes_a_map_worse(
+    room: Room, greys: tuple[int, ...], free_thresh: str
+) -> None:
+    pixels = blocks(*greys)
+    if greys[-1] == 254:
+        pixels[:, -27:] = 205
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*cells cut to")
+        assert "gray" not in str(load_map(room(grey=pixels, free_thresh=free_thresh)).warnings)
+
+
+def test_the_advice_about_unknown_ground_leaves_the_rest_free(room: Room) -> None:
+    grey = blocks(254, 254, 205, 254)
+    with pytest.warns(UserWarning, match=r"lower free_thresh from 0\.25 to 0\.196"):
+        load_map(room(grey=grey, free_thresh="0.25"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*of the free ground lies outside")
+        assert free_bands(room(grey=grey, free_thresh="0.196"), 4) == [True, True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "P", "RGB"])
+def test_a_bmp_image_is_read(room: Room, kind: str) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(blocks(255, 0, 255)).convert(kind).save(buffer, format="BMP")
+    assert free_bands(room(image=buffer.getvalue()), 3) == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "P", "I;16"])
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+def test_cells_are_those_of_the_gray_that_the_image_library_reads(
+    room: Room, kind: str, mode: str
+) -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.choice(np.array([0, 100, 205, 206, 254, 255], dtype=np.uint8), (20, 60))
+    grey[5:15, 5:55] = 255
+    if kind == "I;16":
+        image = Image.fromarray(grey.astype(np.uint16) * 257)
+        expected = grey
+    else:
+        image = Image.fromarray(grey).convert(kind)
+        expected = np.asarray(image.convert("L"))
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = load_map(room(image=buffer.getvalue(), mode=mode))
+    free = (255 - expected[::-1].astype(float)) / 255 < 0.196
+    np.testing.assert_array_equal(~loaded.occupied[1:-1, 1:-1], free)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("mode", "TRINARY"), ("mode", "Scale"), ("negate", "no"), ("negate", "FALSE")],
+)
+def test_values_are_read_in_every_case_as_map_server_does(
+    room: Room, field: str, value: str
+) -> None:
+    assert free_bands(room(grey=blocks(254, 205, 0), **{field: value}), 3) == [True, False, False]
+
+
+def test_tabs_are_blanks_between_a_key_and_its_value(room: Room) -> None:
+    path = room(origin="[1.0,\t2.0 ,0.0\t]\t# where", resolution='"0.1"\t', free_thresh="0.2\t")
+    path.write_text(path.read_text().replace(": ", ":\t"))
+    plain = load_map(room(origin="[1.0, 2.0, 0.0]", free_thresh="0.2"))
+    path.write_text(path.read_text().replace(": ", ":\t \t"))
+    np.testing.assert_array_equal(load_map(path).occupied, plain.occupied)
+    path.write_text("image:\n\troom.pgm\n")
+    with pytest.raises(ValueError, match="not readable as YAML"):
+        load_map(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "line"),
+    [
+        ("spawn_pionts", "unknown key 'spawn_pionts' (is spawn_points meant?): no effect"),
+        ("Max_Steps", "unknown key 'Max_Steps' (is max_steps meant?): no effect"),
+        ("author", "unknown key 'author': no effect"),
+    ],
+)
+def test_an_unknown_key_is_named_with_the_nearest_known_one(
+    room: Room, key: str, line: str
+) -> None:
+    with pytest.warns(UserWarning, match="unknown key") as caught:
+        load_map(room(**{key: "[[1, 1], [2, 2]]"}))
+    assert [str(warning.message).partition(": ")[2] for warning in caught] == [line]
+
+
+def test_a_required_key_that_is_misspelt_is_found(room: Room) -> None:
+    with pytest.raises(ValueError, match=r"free_thresh: missing \(is 'free_tresh' meant\?\)"):
+        load_map(room(drop="free_thresh", free_tresh="0.2"))
+
+
+@pytest.mark.parametrize("clear", [False, True])
+def test_where_nothing_is_free_the_line_says_why(room: Room, clear: bool) -> None:
+    # Black lines on white, or black ink on clear ground.
+    ink = np.zeros((20, 60), dtype=bool)
+    ink[::4] = True
+    if clear:
+        image = png_bytes(np.stack([np.zeros_like(ink), 255 * ink], axis=-1).astype(np.uint8))
+        words = ["0.0% of the pixels are free", "75.0% are transparent, which means unknown"]
+        words.append("negate: 1 would make 25.0% free")
+        path = room(image=image)
+    else:
+        path = room(grey=np.where(ink, 0, 254), negate="1")
+        words = ["25.0% of the pixels are free (negate: 1", "negate: 0 would make 75.0% free"]
+    with pytest.raises(ValueError, match=r"no cell is free for a robot of radius 0\.1 m") as caught:
+        load_map(path)
+    for word in words:
+        assert word in str(caught.value)
+
+
 def test_an_image_in_a_folder_below_is_found(room: Room, tmp_path: Path) -> None:
-    path = room(image_name="x")
+    path = room()
     (tmp_path / "images").mkdir()
     (tmp_path / "room.pgm").rename(tmp_path / "images" / "grid.pgm")
     path.write_text(path.read_text().replace("room.pgm", "images/grid.pgm"))

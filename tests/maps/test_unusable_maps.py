@@ -139,7 +139,8 @@ def test_a_tag_in_a_file_calls_nothing(room: Room, tmp_path: Path) -> None:
     made = tmp_path / "made"
     for tag in ("object/apply:os.mkdir", "object/new:os.mkdir"):
         path = room(note=f"!!python/{tag} ['{made}']")
-        assert load_map(path).shape == (92, 122)
+        with pytest.warns(UserWarning, match="unknown key 'note'"):
+            assert load_map(path).shape == (92, 122)
     assert not made.exists()
 
 
@@ -219,7 +220,7 @@ def png_claiming(width: int, height: int) -> bytes:
         (png_claiming(60_000, 60_000), "more pixels, expected at most 16777216"),
         (png_claiming(9_000, 8_000), "pixels"),
         (b"P5\n120 90\n255\n" + b"\xfe" * 500, "PNG, PGM"),
-        (b"P5\n99999999 99999999\n255\n", "PNG, PGM"),
+        (b"P5\n99999999 99999999\n255\n", "more pixels"),
         (b"P5\n12 9\n0\n" + b"\0" * 108, "PNG, PGM"),
         (b"P5\n12 9\n70000\n" + b"\0" * 216, "PNG, PGM"),
         (b"P5\n-3 9\n255\n", "PNG, PGM"),
