@@ -190,7 +190,7 @@ def test_files_of_one_name_are_told_apart_by_their_folders() -> None:
     }
     assert list(_distinct_names(names).values()) == ["hall/map", "yard/map", "maze", "m/maze"]
     deeper = {"/a/x/map.yaml": "map", "/b/x/map.yaml": "map", "/b/x/map.map": "map"}
-    assert list(_distinct_names(deeper).values()) == ["a/x/map", "x/map.yaml", "x/map.map"]
+    assert list(_distinct_names(deeper).values()) == ["a/x/map", "b/x/map.yaml", "x/map.map"]
     with pytest.raises(ValueError, match="one file twice"):
         _distinct_names({"/x/map.yaml": "map", "/x/../x/map.yaml": "map"})
 
