@@ -10,7 +10,10 @@ def check_map(arguments: list[str]) -> int:
     """Describe a map."""
     parser = Parser(prog="sqn map", description="Check maps.", allow_abbrev=False)
     parser.add_argument("action", choices=["check"], help="check: report on a map")
-    parser.add_argument("file", help="a file, a map of the project by name, or maze:7, maze:0-3")
+    parser.add_argument(
+        "file",
+        help="a file (room.map@0.5: at 0.5 m a cell), a map of the project by name, or maze:0-3",
+    )
     parser.add_argument("--robot-radius", type=float, default=0.1, help="m (default 0.1)")
     parser.add_argument(
         "--allow-outside",
