@@ -57,8 +57,8 @@ def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -
         loaded = complete(drawn, Points(), robot_radius)
     except ValueError as error:
         raise ValueError(f"{named(path)}: map: {error}") from error
-    lines = tuple(f"{named(path)}: {line}" for line in loaded.warnings)
-    return dataclasses.replace(loaded, warnings=lines)
+    notes = tuple(f"{named(path)}: {note}" for note in loaded.warnings)
+    return dataclasses.replace(loaded, warnings=notes)
 
 
 def _side(path: Path, key: str, header: Mapping[bytes, bytes]) -> int:

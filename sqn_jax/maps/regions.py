@@ -72,8 +72,8 @@ def complete(
     """
     enclosed = enclose(drawn)
     if enclosed.occupied.size > MAX_CELLS:
-        rows, cols = enclosed.shape
-        raise ValueError(f"{cols} x {rows} cells with a wall, expected at most {MAX_CELLS}")
+        height, width = enclosed.shape
+        raise ValueError(f"{width} x {height} cells with a wall, expected at most {MAX_CELLS}")
     body_free = traversable(enclosed.occupied, enclosed.resolution, robot_radius)
     labels, count = connected_components(body_free)
     if count == 0:
@@ -194,7 +194,10 @@ def _cut(
     named = [given for given in (points.spawn, points.evaluation) if given is not None]
     with np.errstate(over="ignore", invalid="ignore"):
         cells = [np.clip(grid.to_grid_frame(given), -1e9, 1e9) for given in named]
-    marked = np.concatenate([points_to_cells(given, grid.resolution) for given in cells] or [[]])
+    no_cells = np.empty((0, 2), np.int64)
+    marked = np.concatenate(
+        [points_to_cells(given, grid.resolution) for given in cells] or [no_cells]
+    )
     margin = max(1, math.ceil(min(MARGIN / grid.resolution, MAX_CELLS)))
     sides = []
     for axis, length in enumerate(grid.shape):

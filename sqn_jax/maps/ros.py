@@ -53,8 +53,8 @@ _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free
 _OPTIONAL = ("mode", "spawn_points", "evaluation_points", "region", "spawn_radius", "max_steps")
 # As yaml-cpp, the parser of map_server, reads a truth value.
 _TRUE, _FALSE = (
-    {form for word in words for form in (word, word.capitalize(), word.upper())}
-    for words in (("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off"))
+    {form for value in values for form in (value, value.capitalize(), value.upper())}
+    for values in (("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off"))
 )
 _ANOTHER_REGION = "; region: {point} in the YAML file takes the next"
 _POINT = "[x m, y m]"
