@@ -57,7 +57,7 @@ _TRUE, _FALSE = (
     for values in (("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off"))
 )
 _ANOTHER_REGION = "; region: {point} in the YAML file takes the next"
-_POINT = "[x m, y m]"
+_POINT, _ORIGIN = "[x m, y m]", "[x m, y m, yaw rad]"
 _FREE_GRAY, _OCCUPIED_GRAY = 254, 0
 
 
@@ -142,7 +142,7 @@ def _load_yaml(path: Path, robot_radius: float, allow_outside: bool) -> Occupanc
     if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
         form = f"m per cell, from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
         fail(path, "resolution", fields["resolution"], form)
-    x, y, yaw = _numbers(path, "origin", fields["origin"], 3, "[x m, y m, yaw rad]")
+    x, y, yaw = _numbers(path, "origin", fields["origin"], 3, _ORIGIN)
     points = Points(
         spawn=_points(path, "spawn_points", fields),
         evaluation=_points(path, "evaluation_points", fields),
@@ -161,6 +161,9 @@ def _load_yaml(path: Path, robot_radius: float, allow_outside: bool) -> Occupanc
     )
     image = _read_image(path, fields["image"], allow_outside)
     loaded = _drawn(path, frame, image, thresholds, points, robot_radius)
+    # A wall or a cut moves the corner; what is written must be readable again.
+    if max(map(abs, loaded.origin)) > MAX_PLACE:
+        fail(path, "origin", fields["origin"], _place_form(3, _ORIGIN))
     lines = [f"{named(path)}: {line}" for line in loaded.warnings]
     if unknown is not None:
         lines.append(unknown)
@@ -275,8 +278,12 @@ def _numbers(path: Path, field: str, value: object, count: int, form: str) -> li
         fail(path, field, value, f"{count} numbers {form}")
     numbers = [_number(path, f"{field}[{i}]", item) for i, item in enumerate(value)]
     if max(map(abs, numbers)) > MAX_PLACE:
-        fail(path, field, value, f"{count} numbers {form} from {-MAX_PLACE:g} to {MAX_PLACE:g}")
+        fail(path, field, value, _place_form(count, form))
     return numbers
+
+
+def _place_form(count: int, form: str) -> str:
+    return f"{count} numbers {form} from {-MAX_PLACE:g} to {MAX_PLACE:g}"
 
 
 def _thresholds(path: Path, fields: Mapping[str, Any]) -> Thresholds:

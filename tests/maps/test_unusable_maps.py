@@ -66,6 +66,7 @@ def test_a_missing_key_is_named(room: Room, key: str) -> None:
         ("origin", "[0, 0, .inf]", "finite number"),
         ("origin", "[0, x, 0]", "origin[1]"),
         ("origin", "[0, 0, 1e10]", "1e+09"),
+        ("origin", "[-1e9, 0, 0]", "1e+09"),  # The wall around an open map stands beyond it.
         ("origin", "0", "3 numbers"),
         ("negate", "2", "0 or 1"),
         ("negate", "[]", "0 or 1"),
