@@ -78,8 +78,8 @@ class MapFile:
             )
         if not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
             raise ValueError(
-                f"map {_shortened(self.path)}: expected @ and m per cell, from "
-                f"{MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
+                f"map {_shortened(self.path)}: {self.resolution:g} behind @, expected m per cell "
+                f"from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
             )
 
     def __str__(self) -> str:

@@ -169,6 +169,17 @@ def occupied_cells(image: GrayImage, thresholds: Thresholds) -> NDArray[np.bool_
     return ~free[::-1]
 
 
+def unknown_cells(image: GrayImage, thresholds: Thresholds) -> NDArray[np.bool_] | None:
+    """Cells [H, W], row 0 at the BOTTOM, neither free nor surely occupied; None if none is."""
+    occupancy = level_occupancy(image.white, thresholds)
+    is_sure = (occupancy > thresholds.occupied_thresh) & (occupancy <= 1)
+    sure = is_sure[image.level]
+    if thresholds.mode != "raw" and image.opaque is not None:
+        sure &= image.opaque
+    unknown = occupied_cells(image, thresholds) & ~sure[::-1]
+    return unknown if unknown.any() else None
+
+
 def why_nothing_is_free(image: GrayImage, thresholds: Thresholds) -> str:
     """What makes so few pixels free that no robot fits: negate, transparency, the threshold."""
     parts = [f"{_free_fraction(image, thresholds):.1%} of the pixels are free"]

@@ -45,6 +45,8 @@ class OccupancyMap:
         parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
             points in the same part reach each other.
         weights: for each part how many times as many training tasks as its points alone would give.
+        unknown: bool [H, W], which occupied cells a file says nothing about; None if it is none.
+            Only pictures show the difference.
     """
 
     name: str
@@ -59,6 +61,7 @@ class OccupancyMap:
     tiles: tuple[int, int] = (1, 1)
     parts: tuple[tuple[float, float, float, float], ...] = ()
     weights: tuple[int, ...] = ()
+    unknown: NDArray[np.bool_] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -150,8 +153,12 @@ def moved(
 ) -> OccupancyMap:
     """The same map with other cells, the first of which lies at (row, col) of those it had.
 
-    Points keep their places in the map frame.
+    Points keep their places in the map frame. The cells reach at most one beyond those it had.
     """
+    unknown = occupancy_map.unknown
+    if unknown is not None:
+        rows, cols = occupied.shape
+        unknown = np.pad(unknown, 1)[row + 1 :, col + 1 :][:rows, :cols].copy()
     corner = np.array([col, row]) * occupancy_map.resolution
     x, y = occupancy_map.to_map_frame(corner).tolist()
     return dataclasses.replace(
@@ -160,6 +167,7 @@ def moved(
         spawn_points=occupancy_map.spawn_points - corner,
         evaluation_points=occupancy_map.evaluation_points - corner,
         origin=(x, y, occupancy_map.origin[2]),
+        unknown=unknown,
     )
 
 

@@ -34,6 +34,7 @@ from sqn_jax.maps.image import (
     occupied_cells,
     read_pixels,
     suspicious_level,
+    unknown_cells,
     why_nothing_is_free,
 )
 from sqn_jax.maps.movingai import load_movingai
@@ -184,7 +185,11 @@ def _drawn(
     robot_radius: float,
 ) -> OccupancyMap:
     """The map that an image draws under some thresholds, checked."""
-    drawn = dataclasses.replace(frame, occupied=occupied_cells(image, thresholds))
+    drawn = dataclasses.replace(
+        frame,
+        occupied=occupied_cells(image, thresholds),
+        unknown=unknown_cells(image, thresholds),
+    )
     try:
         loaded = complete(drawn, points, robot_radius, _ANOTHER_REGION)
     except ValueError as error:

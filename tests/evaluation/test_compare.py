@@ -265,7 +265,11 @@ def test_a_run_without_a_checkpoint_is_named(
         (["--episodes", "1000000000000"], ["episodes", "1000000000000", "at most"]),
         (["--seed", "2147483647", "--eval-seeds", "2"], ["seed", "2147483647"]),
         (["--maps", "maze", "maze"], ["maps", "maze", "twice"]),
-        (["--maps", "maze", str(MAZE_FILE)], ["maps", "maze.yaml", "both are called 'maze'"]),
+        (
+            ["--maps", str(MAZE_FILE), str(MAZE_FILE.parent / "../maps/maze.yaml")],
+            ["maps", "maze.yaml", "one file twice"],
+        ),
+        (["--robot-radius", "-1"], ["robot_radius", "-1"]),
         (["--goal-radius", "0.3", "0.3"], ["goal_radii", "0.3", "twice"]),
         (["--velocity-noise", "0.1", "0.1"], ["noise", "0.1", "twice"]),
         (["--velocity-noise", "1e39"], ["noise", "1e+39"]),

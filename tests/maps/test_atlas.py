@@ -68,6 +68,8 @@ def test_a_map_with_an_open_border_is_closed(maps: list[OccupancyMap]) -> None:
     # The wall stands outside: no free cell is lost.
     assert two.occupied[:, 342].all()
     np.testing.assert_array_equal(two.occupied[1:341, 343:683], open_map.occupied)
+    points = open_map.spawn_points + np.array([343, 1]) * open_map.resolution
+    np.testing.assert_allclose(two.spawn_points[-len(points) :], points)
 
 
 def test_points_of_one_map_that_do_not_reach_each_other_are_named(

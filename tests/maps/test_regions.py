@@ -114,6 +114,7 @@ def test_what_no_robot_can_see_is_cut_off_and_coordinates_stay(room: Room, yaw: 
         cell = tuple(points_to_cells(cut.to_grid_frame(in_map), 0.1))
         assert cut.occupied[cell] == whole.occupied[tuple(points_to_cells(point, 0.1))]
     assert (~cut.occupied).sum() == 20 * 40
+    np.testing.assert_array_equal(cut.unknown, cut.occupied)
     np.testing.assert_allclose(cut.to_grid_frame(whole.to_map_frame([3.0, 11.0])), 0, atol=1e-9)
 
 

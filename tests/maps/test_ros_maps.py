@@ -437,3 +437,12 @@ def test_saving_where_one_cannot_write_is_one_clear_line(tmp_path: Path) -> None
         save_map(load_map("maze"), tmp_path / "absent" / "m.yaml")
     with pytest.raises(ValueError, match=r"expected a path ending in \.yaml"):
         save_map(load_map("maze"), tmp_path / "m.png")
+
+
+def test_unknown_ground_is_told_from_obstacles(room: Callable[..., Path]) -> None:
+    grey = np.full((90, 120), 254, dtype=np.uint8)
+    assert load_map(room(grey=grey)).unknown is None
+    grey[:5, :10], grey[10, 20:40] = 205, 0
+    unknown = load_map(room(grey=grey)).unknown
+    assert unknown is not None
+    np.testing.assert_array_equal(unknown, np.pad(grey[::-1] == 205, 1))
