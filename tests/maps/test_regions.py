@@ -132,6 +132,15 @@ def test_another_region_is_cut_off_but_not_what_can_be_seen_through_a_gap(room: 
         assert load_map(room(grey=grey)).shape == (250, 300)
 
 
+def test_a_point_of_the_file_that_cannot_be_seen_lies_in_an_obstacle_not_outside(
+    room: Room,
+) -> None:
+    grey = vast((slice(70, 90), slice(80, 120)))
+    path = room(grey=grey, evaluation_points="[[10.0, 17.0], [28.0, 2.0]]")
+    with pytest.raises(ValueError, match=r"evaluation_points\[1\].*28.*2.*obstacle"):
+        load_map(path)
+
+
 def test_a_map_of_which_half_is_left_is_not_cut(room: Room) -> None:
     assert load_map(room(grey=vast((slice(30, 220), slice(30, 270))))).shape == (250, 300)
 
