@@ -61,6 +61,7 @@ def _suite_file(options: argparse.Namespace) -> Path | None:
         "--max-steps": options.max_steps,
         "--goal-radius": options.goal_radius,
         "--noise-unit": options.noise_unit,
+        "--robot-radius": options.robot_radius is not None,
     }
     for option, value in of_the_file.items():
         if value:
@@ -95,6 +96,7 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
         noise_unit=options.noise_unit,
         goal_radii=tuple(options.goal_radius or (0.3, 0.5)),
         max_steps=options.max_steps,
+        robot_radius=options.robot_radius,
     )
     evaluation = evaluate_session(_agents(options), settings, options.out)
     say_lines(results_table(evaluation["results"]).split("\n"))
@@ -168,6 +170,12 @@ def _parser() -> Parser:
         type=integer,
         default=0,
         help="steps per episode (default: each map's limit)",
+    )
+    add(
+        "--robot-radius",
+        type=number,
+        metavar="M",
+        help="m; the radius of all robots (default: as trained)",
     )
     add(
         "--goal-radius", nargs="+", type=number, default=[], metavar="M", help="m (default 0.3 0.5)"

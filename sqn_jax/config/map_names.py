@@ -2,6 +2,7 @@
 
 maze                  a map of the project
 folder/my_map.yaml    a file
+room.map@0.5          a MovingAI file, which names no scale, at 0.5 m a cell
 maze:7                the procedural maze that belongs to seed 7
 maze,maze:0-14        sixteen maps side by side, to train on all of them
 maze*8,maze:0-14      the same, with eight times as many tasks on the first as on each other
@@ -29,11 +30,17 @@ MAX_WEIGHT = 100
 
 FILE_SUFFIXES = (".yaml", ".yml", ".map")
 
+MIN_RESOLUTION, MAX_RESOLUTION = 1e-6, 1000.0
+"""m per cell."""
+
+_MAX_DIGITS = len(str(MAX_SEED))
+
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
 # Up to the next comma, but for those within quotes that a part begins with.
-_PARTS = re.compile(rf"(?:^|,)\s*((?:{_QUOTED.pattern}(?=[\s,*]|$))?[^,]*)", re.DOTALL)
-_WEIGHTED = re.compile(r"(.+)\*([0-9]{1,9})", re.DOTALL)
-_SEEDS = re.compile(rf"({'|'.join(KINDS)}):([0-9]{{1,9}})(?:-([0-9]{{1,9}}))?")
+_PARTS = re.compile(rf"(?:^|,)\s*((?:{_QUOTED.pattern}(?=[\s,*@]|$))?[^,]*)", re.DOTALL)
+_SCALED = re.compile(r"(.+)@([0-9.]+(?:[eE][-+]?[0-9]+)?)", re.DOTALL)
+_WEIGHTED = re.compile(r"(.+)\*([0-9]+)", re.DOTALL)
+_SEEDS = re.compile(rf"({'|'.join(KINDS)}):([0-9]+)(?:-([0-9]+))?")
 _PROJECT_NAME = re.compile(r'[^\s,*:"/](?:[^,*:"/]*[^\s,*:"/])?')
 
 
@@ -56,13 +63,30 @@ class MapFile:
     """A map in a file."""
 
     path: str
+    resolution: float | None = None
+    """m per cell, `MIN_RESOLUTION` to `MAX_RESOLUTION`; only for files that name none: .map."""
 
     def __post_init__(self) -> None:
         if not self.path:
             raise ValueError("map '': a name is missing, expected the path of a file")
+        if self.resolution is None:
+            return
+        if not self.path.lower().endswith(".map"):
+            raise ValueError(
+                f"map {_shortened(self.path)}: expected @ and m per cell behind a .map file "
+                "alone; a YAML file has its key resolution"
+            )
+        if not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
+            raise ValueError(
+                f"map {_shortened(self.path)}: {self.resolution:g} behind @, expected m per cell "
+                f"from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
+            )
 
     def __str__(self) -> str:
-        """The path, in quotes where `parse` would take it for something else."""
+        """The path, in quotes where `parse` would take it for something else, and the scale."""
+        return self._quoted_path() + ("" if self.resolution is None else f"@{self.resolution!r}")
+
+    def _quoted_path(self) -> str:
         reads_as_it_is = (
             _looks_like_file(self.path)
             and self.path.isprintable()
@@ -70,6 +94,7 @@ class MapFile:
             and not self.path.startswith('"')
             and self.path == self.path.strip()
             and not _WEIGHTED.fullmatch(self.path)
+            and not _SCALED.fullmatch(self.path)
         )
         if reads_as_it_is:
             return self.path
@@ -138,7 +163,7 @@ class MapSet:
     def resolved(self) -> MapSet:
         """The same with absolute paths for all files that exist."""
         names = tuple(
-            MapFile(str(Path(name.path).resolve()))
+            MapFile(str(Path(name.path).resolve()), name.resolution)
             if isinstance(name, MapFile) and Path(name.path).exists()
             else name
             for name in self.names
@@ -185,7 +210,8 @@ def parse(text: str | Path) -> MapSet:
         if not part:
             raise ValueError(f"map {_shortened(text)}: a name is missing, expected {_FORMS}")
         matched = _WEIGHTED.fullmatch(part)
-        name, weight = (matched[1], int(matched[2])) if matched else (part, 1)
+        name, digits = (matched[1], matched[2]) if matched else (part, "1")
+        weight = int(digits) if len(digits) <= _MAX_DIGITS else 0
         if not 1 <= weight <= MAX_WEIGHT:
             raise ValueError(_wrong_weight(part))
         of_part = _parse_name(name, part)
@@ -196,26 +222,54 @@ def parse(text: str | Path) -> MapSet:
 
 _FORMS = (
     "the name of a map of the project, KIND:SEED or KIND:FIRST-LAST for procedural ones (KIND one "
-    f"of {', '.join(KINDS)}), or the path of a .yaml or .map file"
+    f"of {', '.join(KINDS)}), or the path of a .yaml or .map file (room.map@0.5: "
+    "at 0.5 m a cell)"
 )
 
 
 def _parse_name(name: str, part: str) -> list[MapName]:
     """One map, or one for each seed of a range."""
-    if _QUOTED.fullmatch(name):
-        try:
-            return [MapFile(json.loads(name))]
-        except json.JSONDecodeError:
-            raise _unknown(name) from None
-    if _looks_like_file(name):
-        return [MapFile(name)]
+    scaled = _SCALED.fullmatch(name)
+    if scaled and (_QUOTED.fullmatch(scaled[1]) or _looks_like_file(scaled[1])):
+        return [MapFile(_path(scaled[1]), _meters(scaled[2], part))]
+    if _QUOTED.fullmatch(name) or _looks_like_file(name):
+        return [MapFile(_path(name))]
     seeds = _SEEDS.fullmatch(name)
     if seeds is None:
         return [ProjectMap(name)]
-    first, last = int(seeds[2]), int(seeds[3] or seeds[2])
-    if not first <= last < first + MAX_MAPS:
-        raise ValueError(f"map {part!r}: expected up to {MAX_MAPS} seeds, FIRST-LAST")
+    digits = (seeds[2], seeds[3] or seeds[2])
+    if max(map(len, digits)) > _MAX_DIGITS:
+        raise ValueError(f"map {_shortened(part)}: expected seeds from 0 to {MAX_SEED}")
+    first, last = map(int, digits)
+    if last < first:
+        raise ValueError(
+            f"map {part!r}: runs backwards, expected FIRST-LAST, such as {last}-{first}"
+        )
+    if last >= first + MAX_MAPS:
+        raise ValueError(
+            f"map {part!r}: {last - first + 1} maps, expected FIRST-LAST with at most {MAX_MAPS}"
+        )
     return [ProceduralMap(seeds[1], seed) for seed in range(first, last + 1)]
+
+
+def _path(text: str) -> str:
+    """The path of a file, which may stand in quotes."""
+    if not _QUOTED.fullmatch(text):
+        return text
+    try:
+        path: str = json.loads(text)
+    except json.JSONDecodeError:
+        raise _unknown(text) from None
+    return path
+
+
+def _meters(text: str, part: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(
+            f"map {_shortened(part)}: {_shortened(text)}, expected a number of m per cell behind @"
+        ) from None
 
 
 def _looks_like_file(name: str) -> bool:
@@ -223,7 +277,7 @@ def _looks_like_file(name: str) -> bool:
 
 
 def _could_be_split(text: str) -> bool:
-    return bool(set(',*"') & set(text)) or text != text.strip()
+    return bool(set(',*"@') & set(text)) or text != text.strip()
 
 
 def _is_file(text: str) -> bool:

@@ -19,6 +19,7 @@ from sqn_jax.env.free_space import far_sides, free_rectangles
 from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
+    MAX_CELLS,
     OccupancyMap,
     cells_to_points,
     connected_components,
@@ -30,9 +31,6 @@ from sqn_jax.maps import (
 
 NUM_NEIGHBORS = 4
 """Spawn points that count as near a spawn point."""
-
-MAX_CELLS = 2**24
-"""Cells of a map: the table of free space then takes some minutes and a gigabyte."""
 
 MAX_LATTICE_POINTS = 2**22
 """Points on which the covered area is counted; every robot holds a bit of each."""

@@ -103,7 +103,7 @@ class TrainedAgent:
         """The parameters of all training seeds, with a leading axis [S]."""
         params_of_seeds = [params for policy in self.policies for params in policy.params]
         # By NumPy: for each shape of a parameter JAX would compile a program.
-        return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *params_of_seeds)
+        return jax.tree.map(lambda *x: np.stack(x), *params_of_seeds)
 
     def run(
         self,

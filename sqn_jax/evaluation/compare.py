@@ -7,18 +7,21 @@ evaluation file. It prints nothing.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain, product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
+from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
-from sqn_jax.maps import load_map
+from sqn_jax.maps import load_map, step_warning
 
 EPISODES_AT_ONCE = 2_000
 """Episodes of each policy whose results are held at once, unless one evaluation seed has more."""
@@ -52,8 +55,8 @@ def memory_bytes(
         numbers += 5 + 6 * max(_num_skills(agent) for agent in agents)
     batches = 2 + (len(settings.tasks) * len(maps) * settings.eval_seeds if fields else 0)
     records = num_episodes(agents, settings) * len(settings.goal_radii)
-    held = min(settings.episodes * settings.eval_seeds, max(EPISODES_AT_ONCE, settings.episodes))
-    joined = 2 * held + (batches - 2) * settings.episodes
+    loaded = min(settings.episodes * settings.eval_seeds, max(EPISODES_AT_ONCE, settings.episodes))
+    joined = 2 * loaded + (batches - 2) * settings.episodes
     return RECORD_BYTES * records + 4.0 * numbers * steps * joined
 
 
@@ -64,25 +67,65 @@ def _num_skills(agent: Agent) -> int:
 def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
     """Load the maps of an evaluation, for the robot of every agent.
 
+    Files of one name are told apart by their folders: the maps are called `hall/map`, `yard/map`.
+
     Raises:
         ValueError: a map is unusable for a robot.
+
+    Warns:
+        UserWarning: see `load_map`; or an episode is too short for the paths of a map file.
     """
-    radii = dict.fromkeys(agent.env_config.robot_radius for agent in agents)
-    maps = {
-        (name, radius): load_map(name, robot_radius=radius)
-        for name in settings.maps
-        for radius in radii
+    robots = {
+        robot.robot_radius: robot
+        for robot in (robot_for(agent.env_config, settings) for agent in agents)
     }
-    setting_of: dict[str, str] = {}
-    for (name, _), occupancy_map in maps.items():
-        if occupancy_map.tiles != (1, 1):
+    maps = {}
+    for name, (radius, robot) in product(settings.maps, robots.items()):
+        loaded = load_map(name, robot_radius=radius)
+        if loaded.tiles != (1, 1):
             raise ValueError(f"map {name}: several, expected one for an evaluation")
-        if setting_of.setdefault(occupancy_map.name, name) != name:
-            raise ValueError(
-                f"maps {setting_of[occupancy_map.name]} and {name}: both are called "
-                f"{occupancy_map.name!r}, the results could not be told apart"
+        maps[name, radius] = loaded
+        if settings.max_steps == 0 and isinstance(parse(name).names[0], MapFile):
+            step_length = robot.forward_speed * robot.time_step
+            line = step_warning(loaded, radius, step_length, settings.goal_radii[0])
+            if line is not None:
+                warnings.warn(line, stacklevel=2)
+    names = _distinct_names({name: loaded.name for (name, _), loaded in maps.items()})
+    return {key: dataclasses.replace(loaded, name=names[key[0]]) for key, loaded in maps.items()}
+
+
+def _distinct_names(names: Mapping[str, str]) -> dict[str, str]:
+    """By setting, names that differ: to those of files that do not, folders are added.
+
+    Raises:
+        ValueError: one file twice, by different paths.
+    """
+    distinct = {}
+    for setting, name in names.items():
+        twins = [other for other in names if names[other] == name]
+        if len(twins) > 1 and isinstance(parse(setting).names[0], MapFile):
+            paths = [parse(other).names[0] for other in twins]
+            parts = [
+                Path(path.path).resolve().parts if isinstance(path, MapFile) else (str(path),)
+                for path in paths
+            ]
+            own = parts[twins.index(setting)]
+            if parts.count(own) > 1:
+                raise ValueError(
+                    f"maps {' and '.join(twins)}: one file twice, the results could not be told "
+                    "apart"
+                )
+            stems = [(*part[:-1], Path(part[-1]).stem) for part in parts]
+            if stems.count((*own[:-1], Path(own[-1]).stem)) == 1:
+                parts, own = stems, (*own[:-1], Path(own[-1]).stem)
+            length = next(
+                count
+                for count in range(2, len(own) + 1)
+                if sum(part[-count:] == own[-count:] for part in parts) == 1
             )
-    return maps
+            name = "/".join(own[-length:])
+        distinct[setting] = name
+    return distinct
 
 
 def evaluate_agents(
@@ -198,6 +241,11 @@ def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
         "range_noise_unit": config.range_noise_unit,
         "goal_radius": radius,
         "epsilon": agent.epsilon,
+        **(
+            {}
+            if config.robot_radius == agent.env_config.robot_radius
+            else {"robot_radius": config.robot_radius}
+        ),
     }
 
 

@@ -1,8 +1,8 @@
 """Episodes of trained policies, without learning and without auto-reset.
 
-Training seeds, evaluation seeds and episodes are axes of one compiled call. Episodes always run
-`BATCH` at a time in the same compiled program, whatever is returned of them. So an episode is the
-same bit for bit whether it runs alone or beside others, for a score or a picture.
+Episodes of all evaluation seeds run `BATCH` at a time in the same compiled program, whatever is
+returned of them. On a CPU an episode is the same bit for bit whether it runs alone or beside
+others, for a score or a picture. On an accelerator all training seeds run in one call.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def run_seeds(
     tasks: GivenTasks | None = None,
     collision_ends: bool = False,
 ) -> list[EpisodeResults]:
-    """Run the same episodes with S policies in one compiled call, a batch of episodes at a time.
+    """Run the same episodes with S policies, a batch of episodes at a time.
 
     Args:
         keys: [E] from `episode_keys`; independent of any training key.
@@ -165,6 +165,7 @@ def run_seeds(
     """
     radii = goal_radii or [float(env_params.goal_radius)]
     world = without_spawn_points(env_params)
+    groups = _groups(params)
     batches = []
     for first in range(0, len(keys), BATCH):
         count = min(BATCH, len(keys) - first)
@@ -176,8 +177,10 @@ def run_seeds(
             places = own_tasks.starts, own_tasks.goals
         maps = None if own_tasks is None else own_tasks.maps
         results = []
-        for trajectory, starts in _run_batch(
-            own_keys, *places, maps, params, world, network, epsilon
+        for trajectory, starts in (
+            one
+            for group in groups
+            for one in _run_batch(own_keys, *places, maps, group, world, network, epsilon)
         ):
             if own_tasks is None:
                 metrics = metrics_of(trajectory, radii)
@@ -223,9 +226,20 @@ def run_episodes(
     Returns:
         The metrics for each radius, [E] each, and the trajectory with these fields; NumPy arrays.
     """
-    stacked = jax.tree.map(lambda x: np.asarray(x)[None], params)
+    stacked = jax.tree.map(lambda x: np.asarray(x)[None], params)  # JAX would compile a program.
     (results,) = run_seeds(keys, stacked, env_params, network, fields=fields, **options)
     return results.metrics, results.trajectory
+
+
+def _groups(params: Params) -> list[Params]:
+    """The policies [S, ...] that run in one call: all, on a CPU each alone.
+
+    There a call with several takes as long as one after the other, and rounds rewards otherwise.
+    """
+    if jax.default_backend() != "cpu":
+        return [params]
+    num_policies = len(jax.tree.leaves(params)[0])
+    return [jax.tree.map(lambda x, i=i: x[i : i + 1], params) for i in range(num_policies)]
 
 
 @partial(jax.jit, static_argnames="network")

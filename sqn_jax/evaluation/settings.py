@@ -47,6 +47,8 @@ class Settings:
     """m; success is computed for each radius from the same episodes."""
     max_steps: int = 0
     """Steps per episode; 0: the limit of each map."""
+    robot_radius: float | None = None
+    """m; None: that of each robot."""
 
     @property
     def all_eval_seeds(self) -> list[int]:
@@ -88,6 +90,9 @@ def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     return dataclasses.replace(
         env_config,
         max_steps=settings.max_steps,
+        robot_radius=env_config.robot_radius
+        if settings.robot_radius is None
+        else settings.robot_radius,
         near_goal_fraction=0.0,
         velocity_noise=0.0,
         velocity_noise_unit=settings.noise_unit or env_config.velocity_noise_unit,

@@ -99,18 +99,18 @@ class SuiteMaps:
     """The maps of a suite by name, each loaded once, while they fit into some memory."""
 
     def __init__(self, load: LoadMap, cells: int = 2**28) -> None:
-        """`cells` bounds the maps that are held; others are loaded again when they are needed."""
+        """`cells` bounds the maps that stay in memory; others are loaded again when they are needed."""
         self._load, self._left = load, cells
-        self._held: dict[str, OccupancyMap] = {}
+        self._loaded: dict[str, OccupancyMap] = {}
 
     def __call__(self, map_file: str) -> OccupancyMap:
         """The map of this name."""
-        if map_file in self._held:
-            return self._held[map_file]
+        if map_file in self._loaded:
+            return self._loaded[map_file]
         occupancy_map = self._load(map_file)
         if occupancy_map.occupied.size <= self._left:
             self._left -= occupancy_map.occupied.size
-            self._held[map_file] = occupancy_map
+            self._loaded[map_file] = occupancy_map
         return occupancy_map
 
 

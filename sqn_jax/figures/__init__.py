@@ -7,7 +7,7 @@ notebook. Animations are made by `frames`, `gif` and `mp4`.
 from sqn_jax.figures.animation import frames, gif, mp4
 from sqn_jax.figures.curves import gate_entropy_curves, learning_curve, learning_curves
 from sqn_jax.figures.episode import coverage_example, reachability_example
-from sqn_jax.figures.gallery import map_gallery, observation_patterns
+from sqn_jax.figures.gallery import map_gallery, map_picture, observation_patterns
 from sqn_jax.figures.network import network_architecture
 from sqn_jax.figures.noise import robustness
 from sqn_jax.figures.paths import MAX_PATHS, trajectories
@@ -30,6 +30,7 @@ __all__ = [
     "learning_curve",
     "learning_curves",
     "map_gallery",
+    "map_picture",
     "mp4",
     "network_architecture",
     "observation_patterns",

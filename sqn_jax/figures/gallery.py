@@ -7,17 +7,24 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from sqn_jax.evaluation.recording import Episode
-from sqn_jax.figures.ground import arrowhead, draw_map
-from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain
-from sqn_jax.maps import OccupancyMap
+from sqn_jax.figures.ground import FREE, SEEN, UNREACHABLE, arrowhead, draw_map, extent
+from sqn_jax.figures.style import COLORS, DPI, INK, OBSTACLE, WIDTH_IN, plain
+from sqn_jax.maps import OccupancyMap, reachable_cells
 
 MAX_SCANS = 6  # below each map in `observation_patterns`
+# What a cell is to the center of a robot, and its color.
+_KINDS = {"within reach": SEEN, "free": FREE, "unknown": UNREACHABLE, "occupied": OBSTACLE}
+_NUMBERED: dict[str, Any] = {"ls": "", "marker": "o", "ms": 11, "mec": "white"}
 
 
 def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
@@ -39,11 +46,73 @@ def map_gallery(maps: Sequence[OccupancyMap]) -> Figure:
     return figure
 
 
+def map_picture(occupancy_map: OccupancyMap, robot_radius: float) -> Figure:
+    """Draw one map as a robot meets it, axes in m of the map frame, in which files name points.
+
+    The ground that it can reach is tinted. Spawn points are dots, evaluation points numbered ones.
+
+    Args:
+        occupancy_map: one map, or several side by side, which `validate` accepts.
+        robot_radius: m.
+    """
+    kinds = _kinds(occupancy_map, robot_radius)
+    width_m, height_m = occupancy_map.size_m
+    corners = occupancy_map.to_map_frame([(0, 0), (width_m, 0), (0, height_m), (width_m, height_m)])
+    (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
+    height = (WIDTH_IN - 0.6) * (top - bottom) / (right - left)
+    figure = Figure(
+        figsize=(WIDTH_IN, min(max(height, 1.5), 1.5 * WIDTH_IN) + 1.4),
+        dpi=DPI,
+        layout="constrained",
+    )
+    axes = figure.subplots()
+    x, y, yaw = occupancy_map.origin
+    axes.imshow(
+        kinds,
+        cmap=ListedColormap(list(_KINDS.values())),
+        vmin=0,
+        vmax=len(_KINDS) - 1,
+        interpolation="antialiased",
+        interpolation_stage="rgba",
+        transform=Affine2D().rotate(yaw).translate(x, y) + axes.transData,
+        **extent(occupancy_map),
+    )
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    _label_panel(axes, occupancy_map)
+    axes.set_ylabel("y [m]", fontsize=8)
+    spawn = occupancy_map.to_map_frame(occupancy_map.spawn_points)
+    axes.plot(*spawn.T, "o", ls="", ms=5, color=COLORS[0], mec="white", label="spawn point")
+    for number, point in enumerate(occupancy_map.evaluation_points, start=1):
+        _draw_point(axes, occupancy_map.to_map_frame(point), str(number), COLORS[1])
+    shown: list[Artist] = [
+        Patch(fc=color, ec=INK, lw=0.5, label=kind)
+        for kind, color in _KINDS.items()
+        if (kinds == list(_KINDS).index(kind)).any()
+    ]
+    shown += [axes.lines[0], Line2D([], [], label="evaluation point", **_NUMBERED, color=COLORS[1])]
+    figure.legend(handles=shown, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    return figure
+
+
+def _kinds(occupancy_map: OccupancyMap, robot_radius: float) -> NDArray[np.uint8]:
+    """Of every cell [H, W] which of `_KINDS` it is."""
+    kinds = list(_KINDS)
+    cells = np.where(occupancy_map.occupied, kinds.index("occupied"), kinds.index("free"))
+    cells[reachable_cells(occupancy_map, robot_radius)] = kinds.index("within reach")
+    if occupancy_map.unknown is not None:
+        cells[occupancy_map.unknown & occupancy_map.occupied] = kinds.index("unknown")
+    return cells.astype(np.uint8)
+
+
 def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
     """Draw a map with its name and size."""
-    width_m, height_m = occupancy_map.size_m
     draw_map(axes, occupancy_map)
-    axes.set_title(plain(f"{occupancy_map.name}, {width_m:g} x {height_m:g} m"), fontsize=10)
+    _label_panel(axes, occupancy_map)
+
+
+def _label_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
+    width_m, height_m = occupancy_map.size_m
+    axes.set_title(plain(f"{occupancy_map.name}, {width_m:.4g} x {height_m:.4g} m"), fontsize=10)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("x [m]", fontsize=8)
 
@@ -51,7 +120,7 @@ def _draw_panel(axes: Axes, occupancy_map: OccupancyMap) -> None:
 def _draw_point(axes: Axes, point: NDArray[np.floating], name: str, color: str) -> None:
     """Draw a dot at a point x m, y m with a short name in it."""
     x, y = (float(value) for value in point)
-    axes.plot(x, y, marker="o", ms=11, color=color, mec="white")
+    axes.plot(x, y, color=color, **_NUMBERED)
     style: dict[str, Any] = {"color": "white", "fontsize": 7, "fontweight": "bold"}
     axes.annotate(name, (x, y), ha="center", va="center", **style)
 

@@ -1,9 +1,10 @@
 """Maps, on the host: occupancy grids, their files and their distance fields."""
 
-from sqn_jax.maps.check import describe
+from sqn_jax.maps.check import describe, step_warning
 from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
 from sqn_jax.maps.load import load_map
 from sqn_jax.maps.occupancy import (
+    MAX_CELLS,
     OccupancyMap,
     cells_to_points,
     connected_components,
@@ -16,6 +17,7 @@ from sqn_jax.maps.occupancy import (
 from sqn_jax.maps.ros import known_maps, save_map
 
 __all__ = [
+    "MAX_CELLS",
     "OccupancyMap",
     "cells_to_points",
     "connected_components",
@@ -29,6 +31,7 @@ __all__ = [
     "reachable_cells",
     "sample_spawn_points",
     "save_map",
+    "step_warning",
     "traversable",
     "validate",
 ]

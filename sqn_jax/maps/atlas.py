@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sqn_jax.maps.occupancy import OccupancyMap, close_border
+from sqn_jax.maps.occupancy import MAX_CELLS, OccupancyMap, enclose
 
 
 def side_by_side(
@@ -21,7 +21,8 @@ def side_by_side(
     """Lay maps out in tiles as large as the largest, nearly square, row by row from below.
 
     Args:
-        maps: at least one; cells of one size. What they leave of a tile is occupied.
+        maps: at least one. What they leave of a tile is occupied. Cells are as large as the
+            smallest; larger ones, a whole number of times as large, are divided.
         name: of the whole.
         weights: how many times as many tasks each map has in training, >= 1; 1 by default.
 
@@ -30,27 +31,33 @@ def side_by_side(
         take as long as the longest one's.
 
     Raises:
-        ValueError: no map, or cells of different sizes.
+        ValueError: no map, cells of sizes that do not fit, or too many of them.
     """
     if not maps:
         raise ValueError(f"map {name}: no map to lay out, expected at least one")
-    resolution = maps[0].resolution
-    for occupancy_map in maps:
-        if occupancy_map.resolution != resolution:
-            raise ValueError(
-                f"map {name}: {maps[0].name} has cells of {resolution:g} m and "
-                f"{occupancy_map.name} of {occupancy_map.resolution:g} m, expected one size"
-            )
     if len(maps) == 1:
         return dataclasses.replace(maps[0], name=name)
-    height, width = (max(occupancy_map.shape[axis] for occupancy_map in maps) for axis in (0, 1))
-    places, count = _places([occupancy_map.shape for occupancy_map in maps], (height, width))
+    maps = [enclose(occupancy_map) for occupancy_map in maps]
+    finest = min(maps, key=lambda occupancy_map: occupancy_map.resolution)
+    resolution = finest.resolution
+    parts_of_cell = [_parts_of_cell(occupancy_map, finest, name) for occupancy_map in maps]
+    shapes = [
+        (occupancy_map.shape[0] * number, occupancy_map.shape[1] * number)
+        for occupancy_map, number in zip(maps, parts_of_cell, strict=True)
+    ]
+    height, width = (max(shape[axis] for shape in shapes) for axis in (0, 1))
+    places, count = _places(shapes, (height, width))
     columns, rows = _layout(count)
+    if rows * height * columns * width > MAX_CELLS:
+        raise ValueError(
+            f"map {name}: {columns * width} x {rows * height} cells of {resolution:g} m, expected "
+            f"at most {MAX_CELLS:,}: fewer maps, or none whose cells are much larger than others'"
+        )
     occupied = np.ones((rows * height, columns * width), dtype=bool)
     spawn, evaluation, parts = [], [], []
-    for occupancy_map, (tile, row, column) in zip(maps, places, strict=True):
+    for occupancy_map, number, (tile, row, column) in zip(maps, parts_of_cell, places, strict=True):
         top, left = tile // columns * height + row, tile % columns * width + column
-        own = close_border(occupancy_map.occupied)
+        own = occupancy_map.occupied.repeat(number, axis=0).repeat(number, axis=1)
         occupied[top : top + own.shape[0], left : left + own.shape[1]] = own
         corner = np.array([left, top]) * resolution
         spawn.append(occupancy_map.spawn_points + corner)
@@ -69,6 +76,18 @@ def side_by_side(
         parts=tuple(parts),
         weights=tuple(weights or [1] * len(maps)),
     )
+
+
+def _parts_of_cell(coarse: OccupancyMap, fine: OccupancyMap, name: str) -> int:
+    """How many cells of a map fit along the side of one of another."""
+    ratio = coarse.resolution / fine.resolution
+    if abs(ratio - round(ratio)) > 1e-6:
+        raise ValueError(
+            f"map {name}: {fine.name} has cells of {fine.resolution:g} m and {coarse.name} of "
+            f"{coarse.resolution:g} m, expected one size, or a whole multiple of the smaller: "
+            "resample the image of one of them"
+        )
+    return round(ratio)
 
 
 def _places(

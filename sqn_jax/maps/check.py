@@ -19,6 +19,7 @@ from sqn_jax.maps.occupancy import (
 from sqn_jax.outside.messages import shown
 
 _SHOWN_POINTS = 12
+_SEARCHED_CELLS = 2**21
 
 
 def evaluation_distances(
@@ -83,6 +84,76 @@ def _step_warnings(
         f"max_steps is {occupancy_map.max_steps}, but the longest path between evaluation points "
         f"takes at least {steps} steps of {step_length:g} m",
     )
+
+
+def step_warning(
+    occupancy_map: OccupancyMap, robot_radius: float, step_length: float, goal_radius: float
+) -> str | None:
+    """A line if an episode is too short for a shortest path between evaluation points, else None.
+
+    Of many points the first ones of each map are taken. Paths along rows and columns, which are
+    quickly found, are at most sqrt(2) times as long as any; only if they are too long, shortest
+    paths are searched, and on a very large map they are given that much.
+
+    Args:
+        occupancy_map: one map or several side by side, which `validate` accepts.
+        robot_radius: m.
+        step_length: m moved in one step.
+        goal_radius: m; a goal is reached when it is so near.
+    """
+    free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
+    parts = occupancy_map.part_of(occupancy_map.evaluation_points)
+    limit = occupancy_map.max_steps * step_length + goal_radius
+    longest = 0.0
+    for part in np.unique(parts):
+        points = occupancy_map.evaluation_points[parts == part][:_SHOWN_POINTS]
+        cells = points_to_cells(points, occupancy_map.resolution)
+        along = occupancy_map.resolution * max(grid_path(free, cell, cells).max() for cell in cells)
+        if along <= limit:
+            continue
+        if free.size > _SEARCHED_CELLS:
+            longest = max(longest, along / math.sqrt(2))
+            continue
+        for goals, field in goal_fields(free, occupancy_map.resolution, points):
+            del goals
+            reached = field[tuple(cells.T)]
+            longest = max(longest, float(reached[np.isfinite(reached)].max()))
+    if longest <= limit:
+        return None
+    steps = math.ceil((longest - goal_radius) / step_length)
+    return (
+        f"map {occupancy_map.name}: max_steps is {occupancy_map.max_steps}, but the longest path "
+        f"between evaluation points takes at least {steps} steps of {step_length:g} m: no robot "
+        "can arrive in time; the key max_steps of the YAML file or an option sets more"
+    )
+
+
+def grid_path(
+    free: NDArray[np.bool_], start: NDArray[np.int64], cells: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Steps [P] from a free cell to others [P, 2] along rows and columns; 0 where none leads.
+
+    A wave of cells goes out from the start until it has met the others.
+    """
+    width = free.shape[1] + 2
+    open_cells = np.pad(free, 1).ravel()
+    targets = (cells[:, 0] + 1) * width + cells[:, 1] + 1
+    wave = np.array([(start[0] + 1) * width + start[1] + 1])
+    open_cells[wave] = False
+    steps = np.zeros(len(cells), np.int64)
+    mark = np.zeros(len(open_cells), np.int32)
+    count = 0
+    while len(wave) and open_cells[targets].any():
+        count += 1
+        around = np.concatenate([wave + 1, wave - 1, wave + width, wave - width])
+        around = around[open_cells[around]]
+        # Each cell once: the last to write its number there stays.
+        order = np.arange(len(around), dtype=np.int32)
+        mark[around] = order
+        wave = around[mark[around] == order]
+        open_cells[wave] = False
+        steps[np.isin(targets, wave) & (steps == 0)] = count
+    return steps
 
 
 def _pair_lines(

@@ -1,26 +1,34 @@
-"""Map images: from the gray of a PNG or PGM file to occupied cells, as ROS map_server does it."""
+"""Map images: from the gray of a PNG, PNM or BMP file to occupied cells, as map_server does it.
+
+An alpha channel says where a pixel is known: in the modes trinary and scale one that is not wholly
+opaque is unknown, whatever its gray; opaque ones read as if there were no alpha. Mode raw takes no
+notice of it. Color counts as the mean of its channels.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from sqn_jax.maps.occupancy import MAX_CELLS
 from sqn_jax.outside.messages import one_line
 
-MAX_PIXELS = 64 * 2**20
 MAX_IMAGE_BYTES = 512 * 2**20
 MODES = ("trinary", "scale", "raw")
+FORMATS = "PNG, PGM, PPM or BMP"
 _TEXT_KINDS = (b"P1", b"P2", b"P3")
 # See `suspicious_level`.
 _UNKNOWN_GRAY = 205  # of 255
 _NEAR_THRESHOLD = 0.1
+_WHITE_OCCUPANCY = 0.1  # What is lighter is meant to be free.
 _LARGE_FRACTION = 0.2
 _UNKNOWN_FRACTION = 0.01
 
@@ -54,8 +62,8 @@ class GrayImage:
     opaque: NDArray[np.bool_] | None
 
 
-def read_pixels(path: Path, mode: str) -> GrayImage:
-    """Decode a PNG or PGM file; color is averaged, alpha too in trinary mode (as map_server does).
+def read_pixels(path: Path) -> GrayImage:
+    """Decode a PNG, PNM or BMP file.
 
     Raises:
         ValueError: one line, without the file's name: not an image, too large, damaged.
@@ -73,22 +81,32 @@ def read_pixels(path: Path, mode: str) -> GrayImage:
         try:
             with _opened(data) as image:
                 width, height = image.size
-                if width * height > MAX_PIXELS:
-                    raise ValueError(f"{width} x {height} pixels, expected at most {MAX_PIXELS}")
+                if width * height > MAX_CELLS:
+                    raise _TooLarge(f"{width} x {height} pixels")
                 is_png = image.format == "PNG"
             if is_png:
                 _require_whole_png(data)
             with _opened(data) as image:
-                return _to_gray(image, mode)
+                return _to_gray(image)
+        except (_TooLarge, Image.DecompressionBombError) as error:
+            # Pillow's own limit is a multiple of this one.
+            found = str(error) if isinstance(error, _TooLarge) else "more pixels"
+            raise ValueError(
+                f"{found}, expected at most {MAX_CELLS} cells: a smaller or coarser image"
+            ) from error
         except UnidentifiedImageError as error:
-            raise ValueError("contents of another kind, expected a PNG or PGM image") from error
+            raise ValueError(f"contents of another kind, expected a {FORMATS} image") from error
         # Pillow's decoders raise a dozen kinds of error on damaged files: each means unusable.
         except Exception as error:
-            raise ValueError(f"{one_line(error)}, expected a readable PNG or PGM image") from error
+            raise ValueError(f"{one_line(error)}, expected a readable {FORMATS} image") from error
+
+
+class _TooLarge(ValueError):
+    """More pixels than a map may have cells."""
 
 
 def _opened(data: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(data), formats=("PNG", "PPM"))
+    return Image.open(io.BytesIO(data), formats=("PNG", "PPM", "BMP"))
 
 
 def _require_whole_png(data: bytes) -> None:
@@ -107,10 +125,10 @@ def _last_rows(data: bytes, before: int) -> bytes:
         return image.crop((0, max(0, image.height - 2), *image.size)).tobytes()
 
 
-def _to_gray(image: Image.Image, mode: str) -> GrayImage:
+def _to_gray(image: Image.Image) -> GrayImage:
     """Pixels of an open image of any supported kind."""
-    # A palette's transparency is an alpha channel like any other; a single gray or color marked as
-    # clear is none, but makes its pixels unknown where opacity counts.
+    # A palette's transparency is an alpha channel like any other, and so is a gray or a color that
+    # is marked as clear.
     clear = image.info.get("transparency")
     if image.mode in ("I", "I;16", "I;16B", "I;16L"):
         # 16 bits: read as numbers, since a conversion to 8 bits would clip at 255.
@@ -118,18 +136,15 @@ def _to_gray(image: Image.Image, mode: str) -> GrayImage:
         return GrayImage(gray, 65535, None if clear is None else gray != clear)
     if image.mode in ("P", "RGB", "L", "1"):
         channels = "RGB" if image.mode in ("P", "RGB") else "L"
-        has_alpha = clear is not None and (image.mode == "P" or mode == "scale")
-        image = image.convert(channels + "A" if has_alpha else channels)
+        image = image.convert(channels if clear is None else channels + "A")
     if image.mode not in ("L", "LA", "RGB", "RGBA"):
         raise ValueError(f"pixel type {image.mode!r}, expected gray, color or palette")
     pixels = np.asarray(image)
     if pixels.ndim == 2:
         return GrayImage(pixels, 255, None)
-    if image.mode == "RGB":
-        return GrayImage(pixels.sum(axis=-1, dtype=np.int32), 3 * 255, None)
-    opaque = pixels[..., -1] == 255
-    if mode != "trinary":
-        pixels = pixels[..., :-1]
+    opaque = None
+    if image.mode in ("LA", "RGBA"):
+        opaque, pixels = pixels[..., -1] == 255, pixels[..., :-1]
     return GrayImage(pixels.sum(axis=-1, dtype=np.int32), 255 * pixels.shape[-1], opaque)
 
 
@@ -145,30 +160,71 @@ def level_occupancy(white: int, thresholds: Thresholds) -> NDArray[np.float64]:
 def occupied_cells(image: GrayImage, thresholds: Thresholds) -> NDArray[np.bool_]:
     """Occupied cells [H, W] with row 0 at the BOTTOM: whatever is not free, unknown included.
 
-    A pixel is free if its occupancy is below `free_thresh`; in scale mode it must be opaque too.
+    A pixel is free if its occupancy is below `free_thresh`; but for raw mode it must be opaque too.
     """
     free_level = level_occupancy(image.white, thresholds) < thresholds.free_thresh
     free = free_level[image.level]
-    if thresholds.mode == "scale" and image.opaque is not None:
+    if thresholds.mode != "raw" and image.opaque is not None:
         free &= image.opaque
     return ~free[::-1]
 
 
-def suspicious_level(image: GrayImage, thresholds: Thresholds) -> str | None:
-    """One line about a gray level that probably means unknown and yet reads as free, else None.
+def unknown_cells(image: GrayImage, thresholds: Thresholds) -> NDArray[np.bool_] | None:
+    """Cells [H, W], row 0 at the BOTTOM, neither free nor surely occupied; None if none is."""
+    occupancy = level_occupancy(image.white, thresholds)
+    is_sure = (occupancy > thresholds.occupied_thresh) & (occupancy <= 1)
+    sure = is_sure[image.level]
+    if thresholds.mode != "raw" and image.opaque is not None:
+        sure &= image.opaque
+    unknown = occupied_cells(image, thresholds) & ~sure[::-1]
+    return unknown if unknown.any() else None
+
+
+def why_nothing_is_free(image: GrayImage, thresholds: Thresholds) -> str:
+    """What makes so few pixels free that no robot fits: negate, transparency, the threshold."""
+    parts = [f"{_free_fraction(image, thresholds):.1%} of the pixels are free"]
+    if thresholds.mode == "raw":
+        return f"{parts[0]} (mode raw: values below {100 * thresholds.free_thresh:g})"
+    kind = "dark" if thresholds.negate else "light"
+    parts[0] += f" (negate: {thresholds.negate:d}, the {kind} ones)"
+    if image.opaque is not None and not image.opaque.all():
+        clear = 1 - image.opaque.mean()
+        parts.append(f"{clear:.1%} are transparent, which means unknown")
+    other = replace(thresholds, negate=not thresholds.negate)
+    parts.append(f"negate: {other.negate:d} would make {_free_fraction(image, other):.1%} free")
+    return "; ".join(parts)
+
+
+def _free_fraction(image: GrayImage, thresholds: Thresholds) -> float:
+    return 1.0 - float(occupied_cells(image, thresholds).mean())
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """A gray level that reads as free and probably means unknown, and what would change that."""
+
+    text: str
+    thresholds: Thresholds
+    """The same with a `free_thresh` under which the level is not free."""
+
+
+def suspicious_level(image: GrayImage, thresholds: Thresholds) -> Suspicion | None:
+    """A gray level that probably means unknown and yet reads as free, else None.
 
     Map files write unknown as gray 205, occupancy 0.196. A `free_thresh` above that makes all
     unexplored ground free. Suspicious is the largest level, other than the freest one present,
-    whose occupancy is within 0.1 below `free_thresh`, if it fills more than a fifth of the free
-    space; for 205 itself a hundredth is enough, since little else is ever written so.
+    whose occupancy is at least 0.1 and within 0.1 below `free_thresh`, if it fills more than a
+    fifth of the free space; for 205 itself a hundredth is enough, since little else is ever
+    written so.
     """
     if thresholds.mode == "raw":
         return None
     occupancy = level_occupancy(image.white, thresholds)
-    pixels = np.bincount(image.level.ravel(), minlength=image.white + 1)
+    levels = image.level if image.opaque is None else image.level[image.opaque]
+    pixels = np.bincount(levels.ravel(), minlength=image.white + 1)
     free = (occupancy < thresholds.free_thresh) & (pixels > 0)
-    near = free & (occupancy >= thresholds.free_thresh - _NEAR_THRESHOLD)
-    if not free.any() or not near.any():
+    near = free & (occupancy >= max(thresholds.free_thresh - _NEAR_THRESHOLD, _WHITE_OCCUPANCY))
+    if not near.any():
         return None
     near &= occupancy > occupancy[free].min()
     level = int(np.argmax(np.where(near, pixels, 0)))
@@ -176,7 +232,13 @@ def suspicious_level(image: GrayImage, thresholds: Thresholds) -> str | None:
     is_unknown_gray = round(level * 255 / image.white) == _UNKNOWN_GRAY
     if not near[level] or fraction <= (_UNKNOWN_FRACTION if is_unknown_gray else _LARGE_FRACTION):
         return None
-    return (
+    # Rounded down, but not past the next lighter level.
+    threshold = max(math.floor(1000 * occupancy[level]) / 1000, 0.0)
+    if threshold <= occupancy[free & (occupancy < occupancy[level])].max():
+        threshold = float(occupancy[level])
+    text = (
         f"gray {level} of {image.white} (occupancy {occupancy[level]:.3f}) fills {fraction:.0%} of "
-        f"the free space: if it means unknown, lower free_thresh from {thresholds.free_thresh:g}"
+        f"the free space: if it means unknown, lower free_thresh from {thresholds.free_thresh:g} "
+        f"to {threshold:g}"
     )
+    return Suspicion(text, replace(thresholds, free_thresh=threshold))

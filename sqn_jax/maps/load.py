@@ -22,9 +22,10 @@ def load_map(
 
     Args:
         name: "maze" or another map of the project; a path ending in .yaml, .yml or (MovingAI, 1 m a
-            cell) .map; "maze:7", the procedural map of a kind and a seed; or several of these,
-            "maze,maze:0-14", each with a weight perhaps, "maze*8,maze:0-14". Text or what
-            `config.map_names.parse` makes of it; a `Path` is a file.
+            cell unless it says "room.map@0.5") .map; "maze:7", the procedural map of a kind and a
+            seed; or several of these, "maze,maze:0-14", each with a weight perhaps,
+            "maze*8,maze:0-14". Text or what `config.map_names.parse` makes of it; a `Path` is a
+            file.
         robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
         allow_outside: see `load_map_file`.
 
@@ -35,7 +36,7 @@ def load_map(
         ValueError: one line naming the file, the field, the offending value and what was expected.
 
     Warns:
-        UserWarning: a large area whose gray looks like unknown reads as free.
+        UserWarning: see `load_map_file`.
     """
     if isinstance(name, str | Path):
         name = parse(name)
@@ -55,4 +56,9 @@ def _load_one(name: MapName, robot_radius: float, allow_outside: bool) -> Occupa
         validate(made, robot_radius)
         return made
     source = Path(name.path) if isinstance(name, MapFile) else name.name
-    return load_map_file(source, robot_radius=robot_radius, allow_outside=allow_outside)
+    return load_map_file(
+        source,
+        robot_radius=robot_radius,
+        allow_outside=allow_outside,
+        resolution=name.resolution if isinstance(name, MapFile) else None,
+    )

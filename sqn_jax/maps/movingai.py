@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.image import MAX_PIXELS
-from sqn_jax.maps.occupancy import (
-    EVALUATION_COUNT,
-    OccupancyMap,
-    close_border,
-    sample_spawn_points,
-)
+from sqn_jax.maps.occupancy import MAX_CELLS, OccupancyMap
+from sqn_jax.maps.regions import Points, complete
 from sqn_jax.outside.messages import named
 from sqn_jax.outside.reading import read_at_most
 
 _FREE = b".GS"  # ground, and swamp, which can be crossed
 _BLOCKED = b"@OTW"  # out of bounds, trees, water
-_MAX_BYTES = 2 * MAX_PIXELS
+_MAX_BYTES = 2 * MAX_CELLS
 
 
 def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -> OccupancyMap:
@@ -51,17 +47,19 @@ def load_movingai(path: Path, *, robot_radius: float, resolution: float = 1.0) -
     if header.get(b"type") != b"octile" or lines[3].strip() != b"map":
         raise ValueError(f"{named(path)}: header: expected type octile, height, width, map")
     rows, cols = (_side(path, key, header) for key in ("height", "width"))
-    if rows * cols > MAX_PIXELS:
+    if rows * cols > MAX_CELLS:
         raise ValueError(
-            f"{named(path)}: height, width: {rows} x {cols} cells, expected at most {MAX_PIXELS}"
+            f"{named(path)}: height, width: {rows} x {cols} cells, expected at most {MAX_CELLS}"
         )
     free = _free_cells(path, body, rows, cols)
-    occupied = close_border(~free[::-1])
+    empty = np.empty((0, 2))
+    drawn = OccupancyMap(path.stem, ~free[::-1], resolution, empty, empty)
     try:
-        points = sample_spawn_points(occupied, resolution, robot_radius)
+        loaded = complete(drawn, Points(), robot_radius)
     except ValueError as error:
         raise ValueError(f"{named(path)}: map: {error}") from error
-    return OccupancyMap(path.stem, occupied, resolution, points, points[:EVALUATION_COUNT])
+    notes = tuple(f"{named(path)}: {note}" for note in loaded.warnings)
+    return dataclasses.replace(loaded, warnings=notes)
 
 
 def _side(path: Path, key: str, header: Mapping[bytes, bytes]) -> int:

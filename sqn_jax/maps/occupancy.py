@@ -7,6 +7,7 @@ frame turned by the origin's yaw and shifted by its x and y.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ from sqn_jax.maps.distance import clearance_cells, is_clear
 
 SPAWN_COUNT = 16
 EVALUATION_COUNT = 4
+
+MAX_CELLS = 2**24
+"""Cells of a map: the table of free space then takes some minutes and a gigabyte."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,8 @@ class OccupancyMap:
         parts: of these maps, each (left, bottom, right, top) in m; empty for one map alone. Only
             points in the same part reach each other.
         weights: for each part how many times as many training tasks as its points alone would give.
+        unknown: bool [H, W], which occupied cells a file says nothing about; None if it is none.
+            Only pictures show the difference.
     """
 
     name: str
@@ -55,6 +61,7 @@ class OccupancyMap:
     tiles: tuple[int, int] = (1, 1)
     parts: tuple[tuple[float, float, float, float], ...] = ()
     weights: tuple[int, ...] = ()
+    unknown: NDArray[np.bool_] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -129,6 +136,46 @@ def close_border(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return closed
 
 
+def enclose(occupancy_map: OccupancyMap) -> OccupancyMap:
+    """The same map within a wall: a ring of occupied cells around it if its border is not closed.
+
+    No cell of the map changes, and in the map frame all points stay where they are; the origin is
+    that of the wall's corner.
+    """
+    occupied = occupancy_map.occupied
+    if occupied[[0, -1]].all() and occupied[:, [0, -1]].all():
+        return occupancy_map
+    return moved(occupancy_map, np.pad(occupied, 1, constant_values=True), -1, -1)
+
+
+def moved(
+    occupancy_map: OccupancyMap, occupied: NDArray[np.bool_], row: int, col: int
+) -> OccupancyMap:
+    """The same map with other cells, the first of which lies at (row, col) of those it had.
+
+    Points keep their places in the map frame. The cells reach at most one beyond those it had.
+    """
+    unknown = occupancy_map.unknown
+    if unknown is not None:
+        rows, cols = occupied.shape
+        unknown = np.pad(unknown, 1)[row + 1 :, col + 1 :][:rows, :cols].copy()
+    corner = np.array([col, row]) * occupancy_map.resolution
+    x, y = occupancy_map.to_map_frame(corner).tolist()
+    return dataclasses.replace(
+        occupancy_map,
+        occupied=occupied,
+        spawn_points=occupancy_map.spawn_points - corner,
+        evaluation_points=occupancy_map.evaluation_points - corner,
+        origin=(x, y, occupancy_map.origin[2]),
+        unknown=unknown,
+    )
+
+
+def no_room(robot_radius: float) -> str:
+    """What is wrong with a map on which a robot fits nowhere."""
+    return f"no free space: no cell is free for a robot of radius {robot_radius:g} m"
+
+
 def traversable(
     occupied: NDArray[np.bool_], resolution: float, robot_radius: float
 ) -> NDArray[np.bool_]:
@@ -163,12 +210,23 @@ def largest_component(free: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def sample_spawn_points(
-    occupied: NDArray[np.bool_], resolution: float, robot_radius: float, count: int = SPAWN_COUNT
+    occupied: NDArray[np.bool_],
+    resolution: float,
+    robot_radius: float,
+    count: int = SPAWN_COUNT,
+    component: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Well-spread points for a map that names none; the first ones are the farthest apart.
 
     Farthest-point sampling (straight-line distance, deterministic) over the middle of the corridors
-    and rooms, i.e. local maxima of the obstacle distance, of the largest connected component.
+    and rooms, i.e. local maxima of the obstacle distance, of a connected component.
+
+    Args:
+        occupied: bool [H, W].
+        resolution: m per cell.
+        robot_radius: m.
+        count: how many points, at most.
+        component: bool [H, W], the cells to choose from; the largest component by default.
 
     Returns:
         float64 [<= count, 2] grid-frame (x, y) in m; fewer points only if there are fewer cells.
@@ -177,9 +235,10 @@ def sample_spawn_points(
         ValueError: no free space for the robot.
     """
     clearance = clearance_cells(occupied)
-    component = largest_component(traversable(occupied, resolution, robot_radius))
+    if component is None:
+        component = largest_component(traversable(occupied, resolution, robot_radius))
     if not component.any():
-        raise ValueError(f"no free space for a robot of radius {robot_radius:g} m")
+        raise ValueError(no_room(robot_radius))
     clearance = np.where(component, clearance, 0.0)
     window = 2 * min(50, math.ceil(0.5 / resolution)) + 1
     middle = component & (clearance == ndimage.maximum_filter(clearance, size=window))
@@ -225,7 +284,7 @@ def validate(occupancy_map: OccupancyMap, robot_radius: float, source: str | Non
             raise ValueError(f"{source}: {field}: {count} given, expected at least 2 points")
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
     if not free.any():
-        raise ValueError(f"{source}: no free space for a robot of radius {robot_radius:g} m")
+        raise ValueError(f"{source}: {no_room(robot_radius)}")
     labels, _ = connected_components(free)
     rows, cols = occupancy_map.shape
     labeled_points: list[tuple[str, int, int]] = []

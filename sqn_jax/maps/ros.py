@@ -1,49 +1,49 @@
-"""Maps in the form of ROS map_server: a YAML file beside an image, with four keys of our own.
+"""Maps in the form of ROS map_server: a YAML file beside an image, with five keys of our own.
 
-The keys `spawn_points`, `evaluation_points` (lists of [x, y] in the map frame, m), `spawn_radius`
-(m) and `max_steps` are optional; map_server ignores them.
+The keys `spawn_points`, `evaluation_points` (lists of [x, y] in the map frame, m), `region` (one
+such point), `spawn_radius` (m) and `max_steps` are optional; map_server ignores them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
+import os
 import re
 import reprlib
 import warnings
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from sqn_jax.config.map_names import MAX_RESOLUTION, MIN_RESOLUTION
+from sqn_jax.maps.fields import fail, read_fields
 from sqn_jax.maps.image import (
+    FORMATS,
     MODES,
     GrayImage,
+    Suspicion,
     Thresholds,
     occupied_cells,
     read_pixels,
     suspicious_level,
+    unknown_cells,
+    why_nothing_is_free,
 )
 from sqn_jax.maps.movingai import load_movingai
-from sqn_jax.maps.occupancy import (
-    EVALUATION_COUNT,
-    OccupancyMap,
-    close_border,
-    sample_spawn_points,
-    validate,
-)
-from sqn_jax.outside.messages import named, one_line
-from sqn_jax.outside.reading import read_at_most
+from sqn_jax.maps.occupancy import OccupancyMap, no_room, reachable_cells, validate
+from sqn_jax.maps.regions import SMALLEST_REGION, Points, complete
+from sqn_jax.outside.messages import named
+from sqn_jax.outside.reading import no_file
 
 DEFAULT_ROBOT_RADIUS = 0.1
-MAX_YAML_BYTES = 2**20
 MAX_POINTS = 10_000
-MIN_RESOLUTION, MAX_RESOLUTION = 1e-6, 1000.0  # m per cell
 MAX_PLACE = 1e9
 """m or rad; up to here float64 knows a point to about a tenth of a micrometer."""
 _INSIDE = (
@@ -52,6 +52,14 @@ _INSIDE = (
     "load_map(..., allow_outside=True))"
 )
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+_OPTIONAL = ("mode", "spawn_points", "evaluation_points", "region", "spawn_radius", "max_steps")
+# As yaml-cpp, the parser of map_server, reads a truth value.
+_TRUE, _FALSE = (
+    {form for value in values for form in (value, value.capitalize(), value.upper())}
+    for values in (("1", "y", "yes", "true", "on"), ("0", "n", "no", "false", "off"))
+)
+_ANOTHER_REGION = "; region: {point} in the YAML file takes the next"
+_POINT, _ORIGIN = "[x m, y m]", "[x m, y m, yaw rad]"
 _FREE_GRAY, _OCCUPIED_GRAY = 254, 0
 
 
@@ -70,18 +78,20 @@ def load_map_file(
     *,
     robot_radius: float = DEFAULT_ROBOT_RADIUS,
     allow_outside: bool = False,
+    resolution: float | None = None,
 ) -> OccupancyMap:
     """Load and check one map, by the name of one of the project's own or by the path of a file.
 
-    Unknown cells count as occupied and the border is closed. A map without spawn points gets
-    sixteen spread over its largest free region, and the first four of these, which lie farthest
-    apart, as evaluation points.
+    Unknown cells count as occupied. A map with free cells at its border gets a wall around it. One
+    without spawn points gets sixteen spread over a free region (`regions.complete` says which), and
+    the first four of these, which lie farthest apart, as evaluation points.
 
     Args:
-        name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI, 1 m a cell) .map.
+        name_or_path: "maze", or a path ending in .yaml, .yml or (MovingAI) .map.
         robot_radius: m, >= 0; free space and reachability are judged for a robot of this size.
         allow_outside: let a YAML file name an image outside its own folder, by a path that leads
-            out of it or by a link. It must still be a PNG or PNM file of the usual size.
+            out of it or by a link. It must still be an image of the usual size.
+        resolution: m per cell of a .map file, which names none; 1 by default.
 
     Returns:
         The map, points in the grid frame.
@@ -90,7 +100,8 @@ def load_map_file(
         ValueError: one line naming the file, the field, the offending value and what was expected.
 
     Warns:
-        UserWarning: a large area whose gray looks like unknown reads as free.
+        UserWarning: a large area whose gray looks like unknown reads as free, an unknown key, much
+            ground that cannot be reached from the points, or cells that were cut off.
     """
     if not (math.isfinite(robot_radius) and robot_radius >= 0):
         raise ValueError(f"robot_radius: {robot_radius!r}, expected a length >= 0 in m")
@@ -100,10 +111,18 @@ def load_map_file(
     else:
         path = Path(name_or_path)
     if path.suffix.lower() == ".map":
-        loaded = load_movingai(path, robot_radius=robot_radius)
+        loaded = load_movingai(
+            path, robot_radius=robot_radius, resolution=1.0 if resolution is None else resolution
+        )
+        for line in loaded.warnings:
+            warnings.warn(line, UserWarning, stacklevel=3)
         validate(loaded, robot_radius, source=named(path))
         return loaded
     if path.suffix.lower() not in (".yaml", ".yml"):
+        if os.path.isdir(path):  # False for what is no possible name.
+            raise ValueError(
+                f"{named(path)}: a folder, expected a .yaml or .map file{_inside(path)}"
+            )
         raise ValueError(
             f"unknown map {str(name_or_path)!r}, expected one of: {', '.join(known)}, a procedural "
             "one such as maze:7, or the path of a .yaml or .map file"
@@ -111,46 +130,96 @@ def load_map_file(
     return _load_yaml(path, robot_radius, allow_outside)
 
 
+def _inside(folder: Path) -> str:
+    """What maps a folder holds, for an error; nothing if there are none, or many."""
+    names = sorted(path.name for path in folder.glob("*") if path.suffix in (".yaml", ".map"))
+    return f", such as {', '.join(map(repr, names))} in it" if 1 <= len(names) <= 5 else ""
+
+
 def _load_yaml(path: Path, robot_radius: float, allow_outside: bool) -> OccupancyMap:
     """Load one map_server YAML file with its image."""
-    fields = _read_fields(path)
+    fields, unknown = read_fields(path, _REQUIRED, _OPTIONAL)
     thresholds = _thresholds(path, fields)
     resolution = _number(path, "resolution", fields["resolution"])
     if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
         form = f"m per cell, from {MIN_RESOLUTION:g} to {MAX_RESOLUTION:g}"
-        _fail(path, "resolution", fields["resolution"], form)
-    x, y, yaw = _numbers(path, "origin", fields["origin"], 3, "[x m, y m, yaw rad]")
-    origin = (x, y, yaw)
-    image = _read_image(path, fields["image"], thresholds.mode, allow_outside)
-    notes = []
-    if (note := suspicious_level(image, thresholds)) is not None:
-        notes.append(f"{named(path)}: {note}")
-        warnings.warn(notes[0], UserWarning, stacklevel=4)
-    occupied = close_border(occupied_cells(image, thresholds))
+        fail(path, "resolution", fields["resolution"], form)
+    x, y, yaw = _numbers(path, "origin", fields["origin"], 3, _ORIGIN)
+    points = Points(
+        spawn=_points(path, "spawn_points", fields),
+        evaluation=_points(path, "evaluation_points", fields),
+        region=_region(path, fields),
+    )
     empty = np.empty((0, 2))
-    frame = OccupancyMap(path.stem, occupied, resolution, empty, empty, origin)
-    spawn = _points(path, "spawn_points", fields, frame)
-    evaluation = _points(path, "evaluation_points", fields, frame)
-    if spawn is None or evaluation is None:
-        try:
-            sampled = sample_spawn_points(occupied, resolution, robot_radius)
-        except ValueError as error:
-            raise ValueError(f"{named(path)}: image: {error}") from error
-        spawn = sampled if spawn is None else spawn
-        evaluation = sampled[:EVALUATION_COUNT] if evaluation is None else evaluation
-    loaded = OccupancyMap(
+    frame = OccupancyMap(
         name=path.stem,
-        occupied=occupied,
+        occupied=np.ones((1, 1), dtype=bool),
         resolution=resolution,
-        spawn_points=spawn,
-        evaluation_points=evaluation,
-        origin=origin,
+        spawn_points=empty,
+        evaluation_points=empty,
+        origin=(x, y, yaw),
         spawn_radius=_spawn_radius(path, fields),
         max_steps=_max_steps(path, fields),
-        warnings=tuple(notes),
     )
+    image = _read_image(path, fields["image"], allow_outside)
+    loaded = _drawn(path, frame, image, thresholds, points, robot_radius)
+    # A wall or a cut moves the corner; what is written must be readable again.
+    if max(map(abs, loaded.origin)) > MAX_PLACE:
+        fail(path, "origin", fields["origin"], _place_form(3, _ORIGIN))
+    lines = [f"{named(path)}: {line}" for line in loaded.warnings]
+    if unknown is not None:
+        lines.append(unknown)
+    suspicion = suspicious_level(image, thresholds)
+    if suspicion is not None and _helps(path, frame, image, suspicion, points, robot_radius):
+        lines.append(f"{named(path)}: {suspicion.text}")
+    for line in lines:
+        warnings.warn(line, UserWarning, stacklevel=4)
+    return dataclasses.replace(loaded, warnings=tuple(lines))
+
+
+def _drawn(
+    path: Path,
+    frame: OccupancyMap,
+    image: GrayImage,
+    thresholds: Thresholds,
+    points: Points,
+    robot_radius: float,
+) -> OccupancyMap:
+    """The map that an image draws under some thresholds, checked."""
+    drawn = dataclasses.replace(
+        frame,
+        occupied=occupied_cells(image, thresholds),
+        unknown=unknown_cells(image, thresholds),
+    )
+    try:
+        loaded = complete(drawn, points, robot_radius, _ANOTHER_REGION)
+    except ValueError as error:
+        if str(error) == no_room(robot_radius):
+            reason = f"image: {error}: {why_nothing_is_free(image, thresholds)}"
+        elif str(error).startswith("region"):
+            reason = str(error)
+        else:
+            reason = f"image: {error}"
+        raise ValueError(f"{named(path)}: {reason}") from error
     validate(loaded, robot_radius, source=named(path))
     return loaded
+
+
+def _helps(
+    path: Path,
+    frame: OccupancyMap,
+    image: GrayImage,
+    suspicion: Suspicion,
+    points: Points,
+    robot_radius: float,
+) -> bool:
+    """Whether the map is still one, with room in it, if one does what a warning advises."""
+    try:
+        changed = _drawn(path, frame, image, suspicion.thresholds, points, robot_radius)
+    except ValueError:
+        return False
+    room = np.count_nonzero(reachable_cells(changed, robot_radius)) * frame.resolution**2
+    return bool(room >= SMALLEST_REGION)
 
 
 def save_map(occupancy_map: OccupancyMap, yaml_path: str | Path) -> None:
@@ -196,47 +265,6 @@ def _yaml_text(occupancy_map: OccupancyMap, image_name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _fail(path: Path, field: str, value: object, expected: str) -> NoReturn:
-    """Raise the one line every unusable file ends in; long and deep values are shortened."""
-    shown = reprlib.repr(value)[:100]
-    raise ValueError(f"{named(path)}: {field}: {shown}, expected {expected}")
-
-
-class _TextLoader(yaml.BaseLoader):
-    """The safest of YAML's loaders, and no key may stand twice.
-
-    It builds nothing but text, lists and mappings, so that what counts as a number is decided
-    below, the same for 0.05, 5e-2 and "0.05".
-    """
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """A mapping; readers differ on which of two equal keys counts, so there is to be one."""
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
-        if len(mapping) < len(node.value):
-            counts = Counter(key.value for key, _ in node.value)
-            twice = max(counts, key=counts.__getitem__)
-            raise ValueError(f"{reprlib.repr(twice)} stands twice, expected every key once")
-        return mapping
-
-
-def _read_fields(path: Path) -> Mapping[str, Any]:
-    """The YAML file as a mapping of its keys to text (or nested lists of text)."""
-    data = read_at_most(path, MAX_YAML_BYTES, "a map's YAML file")
-    try:
-        fields = yaml.load(data, Loader=_TextLoader)
-    # The parser raises a dozen kinds of error on damaged files: each means unusable.
-    except Exception as error:
-        reason = one_line(error)[:200]
-        raise ValueError(f"{named(path)}: not readable as YAML ({reason})") from error
-    if not isinstance(fields, dict):
-        _fail(path, "file", fields, "a mapping with the keys of a map_server YAML file")
-    for key in _REQUIRED:
-        if key not in fields:
-            keys = ", ".join(_REQUIRED)
-            raise ValueError(f"{named(path)}: {key}: missing, expected the keys {keys}")
-    return fields
-
-
 def _number(path: Path, field: str, value: object) -> float:
     """A finite number from a YAML scalar."""
     # float() alone would also take "1_000", "infinity" and digits of other alphabets.
@@ -247,44 +275,48 @@ def _number(path: Path, field: str, value: object) -> float:
             number = math.nan
         if math.isfinite(number):
             return number
-    _fail(path, field, value, "a finite number")
+    fail(path, field, value, "a finite number")
 
 
 def _numbers(path: Path, field: str, value: object, count: int, form: str) -> list[float]:
     """A list of `count` numbers that is a place: none larger than `MAX_PLACE`."""
     if not isinstance(value, list) or len(value) != count:
-        _fail(path, field, value, f"{count} numbers {form}")
+        fail(path, field, value, f"{count} numbers {form}")
     numbers = [_number(path, f"{field}[{i}]", item) for i, item in enumerate(value)]
     if max(map(abs, numbers)) > MAX_PLACE:
-        _fail(path, field, value, f"{count} numbers {form} from {-MAX_PLACE:g} to {MAX_PLACE:g}")
+        fail(path, field, value, _place_form(count, form))
     return numbers
+
+
+def _place_form(count: int, form: str) -> str:
+    return f"{count} numbers {form} from {-MAX_PLACE:g} to {MAX_PLACE:g}"
 
 
 def _thresholds(path: Path, fields: Mapping[str, Any]) -> Thresholds:
     """The keys that say how gray becomes occupancy."""
     mode = fields.get("mode", "trinary")
-    if mode not in MODES:
-        _fail(path, "mode", mode, f"one of {', '.join(MODES)}")
+    if not isinstance(mode, str) or mode.lower() not in MODES:
+        fail(path, "mode", mode, f"one of {', '.join(MODES)}")
     negate = fields["negate"]
-    if negate not in ("0", "1", "true", "false", "True", "False"):
-        _fail(path, "negate", negate, "0 or 1")
+    if not isinstance(negate, str) or negate not in _TRUE | _FALSE:
+        fail(path, "negate", negate, "0 or 1")
     limits = {}
     for field in ("occupied_thresh", "free_thresh"):
         limits[field] = _number(path, field, fields[field])
         if not 0 <= limits[field] <= 1:
-            _fail(path, field, fields[field], "a number from 0 to 1")
+            fail(path, field, fields[field], "a number from 0 to 1")
     if limits["free_thresh"] >= limits["occupied_thresh"]:
-        _fail(path, "free_thresh", fields["free_thresh"], "a number below occupied_thresh")
-    return Thresholds(mode=mode, negate=negate in ("1", "true", "True"), **limits)
+        fail(path, "free_thresh", fields["free_thresh"], "a number below occupied_thresh")
+    return Thresholds(mode=mode.lower(), negate=negate in _TRUE, **limits)
 
 
 def _image_path(path: Path, name: object, allow_outside: bool) -> Path:
     """The image a YAML file names: in the same folder or below, unless it may lie outside."""
-    form = "the name of a PNG or PGM file"
+    form = f"the name of a {FORMATS} file"
     if not allow_outside:
         form += " in the YAML file's folder"
     if not isinstance(name, str) or not name or "\0" in name:
-        _fail(path, "image", name, form)
+        fail(path, "image", name, form)
     try:
         folder = path.parent.resolve()
         image_path = (folder / name).resolve()
@@ -292,36 +324,40 @@ def _image_path(path: Path, name: object, allow_outside: bool) -> Path:
     # Too long, a circle of links, or a character that no name of a file can hold.
     except (OSError, RuntimeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no file can have this name"
-        _fail(path, "image", name, f"{form} ({reason})")
+        fail(path, "image", name, f"{form} ({reason})")
     if not (allow_outside or image_path.is_relative_to(folder)):
-        _fail(path, "image", name, _INSIDE)
+        fail(path, "image", name, _INSIDE)
     if not is_file:
-        _fail(path, "image", name, f"{form} (no such file)")
+        fail(path, "image", name, f"{form} ({no_file(image_path)})")
     return image_path
 
 
-def _read_image(path: Path, name: object, mode: str, allow_outside: bool) -> GrayImage:
+def _read_image(path: Path, name: object, allow_outside: bool) -> GrayImage:
     """The pixels of the image a YAML file names."""
     image_path = _image_path(path, name, allow_outside)
     try:
-        return read_pixels(image_path, mode)
+        return read_pixels(image_path)
     except OSError as error:
-        _fail(path, "image", name, f"a PNG or PGM file that can be read ({error.strerror})")
+        fail(path, "image", name, f"a {FORMATS} file that can be read ({error.strerror})")
     except ValueError as error:
         raise ValueError(f"{named(path)}: image: {reprlib.repr(name)}: {error}") from error
 
 
-def _points(
-    path: Path, field: str, fields: Mapping[str, Any], frame: OccupancyMap
-) -> NDArray[np.float64] | None:
-    """A list of points, from the file's map frame to the grid frame; None if the key is absent."""
+def _points(path: Path, field: str, fields: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """A list of points in the map frame, m; None if the key is absent."""
     if field not in fields:
         return None
     value = fields[field]
     if not isinstance(value, list) or not 2 <= len(value) <= MAX_POINTS:
-        _fail(path, field, value, f"a list of 2 to {MAX_POINTS} points [x m, y m]")
-    points = [_numbers(path, f"{field}[{i}]", p, 2, "[x m, y m]") for i, p in enumerate(value)]
-    return frame.to_grid_frame(np.array(points))
+        fail(path, field, value, f"a list of 2 to {MAX_POINTS} points [x m, y m]")
+    return np.array([_numbers(path, f"{field}[{i}]", p, 2, _POINT) for i, p in enumerate(value)])
+
+
+def _region(path: Path, fields: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """The key `region`, a point in the map frame, m."""
+    if "region" not in fields:
+        return None
+    return np.array(_numbers(path, "region", fields["region"], 2, _POINT))
 
 
 def _spawn_radius(path: Path, fields: Mapping[str, Any]) -> float:
@@ -331,7 +367,7 @@ def _spawn_radius(path: Path, fields: Mapping[str, Any]) -> float:
     radius = _number(path, "spawn_radius", fields["spawn_radius"])
     if not 0 <= radius <= MAX_PLACE:
         form = f"a length >= 0 in m, at most {MAX_PLACE:g}"
-        _fail(path, "spawn_radius", fields["spawn_radius"], form)
+        fail(path, "spawn_radius", fields["spawn_radius"], form)
     return radius
 
 
@@ -341,5 +377,5 @@ def _max_steps(path: Path, fields: Mapping[str, Any]) -> int:
         return OccupancyMap.max_steps
     steps = _number(path, "max_steps", fields["max_steps"])
     if steps != int(steps) or not 1 <= steps <= 1_000_000:
-        _fail(path, "max_steps", fields["max_steps"], "a whole number from 1 to 1000000")
+        fail(path, "max_steps", fields["max_steps"], "a whole number from 1 to 1000000")
     return int(steps)

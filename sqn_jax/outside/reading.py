@@ -73,6 +73,14 @@ def kind_of(mode: int) -> str:
     return _KINDS.get(stat.S_IFMT(mode), "a special file")
 
 
+def no_file(path: Path) -> str:
+    """What stands in the place of a file that is none: nothing, a folder, or a pipe, say."""
+    try:
+        return f"is {kind_of(path.stat().st_mode)}"
+    except (OSError, ValueError):
+        return "no such file"
+
+
 def read_at_most(path: Path, limit: int, expected: str, *, follow: bool = True) -> bytes:
     """The contents of a regular file of at most `limit` bytes; a larger one is not read.
 

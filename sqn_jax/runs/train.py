@@ -9,6 +9,7 @@ import dataclasses
 import os
 import signal
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,8 +20,9 @@ from jax import Array
 
 from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
+from sqn_jax.config.map_names import MapFile
 from sqn_jax.env import EnvParams, make_env
-from sqn_jax.maps import OccupancyMap, load_map
+from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.outside.messages import say
 from sqn_jax.outside.reading import read_at_most
 from sqn_jax.policies.pretrained import find_policy
@@ -86,6 +88,7 @@ def train_session(
     mesh = devices.choose(config, num_devices)
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
+    _warn_of_short_episodes(occupancy_map, config)
     program = make_program(env_params, config, mesh)
     # Errors up to here leave no files behind.
     num_bytes = memory_bytes(env_params, program)
@@ -114,6 +117,20 @@ def train_session(
         if board is not None and has_figures:
             _add_figures(board, config, folder)
     final_evaluation.conclude(results, training.timing, has_figures, config, folder)
+
+
+def _warn_of_short_episodes(occupancy_map: OccupancyMap, config: TrainConfig) -> None:
+    """Warn if the limit that a map file sets is too short for its paths."""
+    from_files = any(isinstance(name, MapFile) for name in config.maps.names)
+    if from_files and config.env.max_steps == 0:
+        line = step_warning(
+            occupancy_map,
+            config.env.robot_radius,
+            config.env.forward_speed * config.env.time_step,
+            config.env.goal_radius,
+        )
+        if line is not None:
+            warnings.warn(line, stacklevel=2)
 
 
 def _first_map(config: TrainConfig, occupancy_map: OccupancyMap) -> OccupancyMap:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sqn_jax.config.groups import EnvConfig
+from sqn_jax.config.map_names import MAX_RESOLUTION, MIN_RESOLUTION
 from sqn_jax.maps.movingai import load_movingai
-from sqn_jax.maps.ros import MAX_RESOLUTION, MIN_RESOLUTION
 from sqn_jax.outside.messages import named, one_line
 from sqn_jax.outside.reading import read_at_most
 from sqn_jax.tasks.convert import ConvertedMap, by_number, finite_number

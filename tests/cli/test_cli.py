@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sqn_jax.cli import main
 from sqn_jax.runs import train
@@ -45,6 +46,8 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
         (["train", "--run-dir", ""], ["--run-dir", "empty"]),
         (["map", "check"], ["file"]),
         (["map", "check", "nowhere"], ["nowhere", "maze"]),
+        (["map", "check", "maze:0-3", "--picture", "x.png"], ["--picture x.png", "4 maps"]),
+        (["map", "check", "maze", "--picture", "x.jpg"], ["--picture x.jpg", ".png"]),
     ],
 )
 def test_wrong_words_are_named_in_one_line(
@@ -53,6 +56,17 @@ def test_wrong_words_are_named_in_one_line(
     told = refused(capsys, words)
     for name in names:
         assert name in told, (name, told)
+
+
+def test_a_map_is_drawn_where_one_asks_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "new" / "map.png"
+    assert main(["map", "check", "maze", "--picture", str(path)]) == 0
+    assert capsys.readouterr().out.endswith(f"wrote {path}\n")
+    with Image.open(path) as image:
+        assert image.width == 1440
+        image.verify()
 
 
 @pytest.mark.parametrize("command", ["", "train", "evaluate", "map check"])

@@ -37,6 +37,7 @@ PATHS = st.one_of(PATH_TEXT, PATH_TEXT.map(lambda text: text + ".yaml"))
 NAMES = st.one_of(
     st.from_regex(r"[a-z]\w{0,8}", fullmatch=True).map(ProjectMap),
     PATHS.map(MapFile),
+    st.builds(MapFile, PATH_TEXT.map(lambda text: text + ".map"), st.floats(1e-6, 1e3)),
     st.builds(
         ProceduralMap,
         st.sampled_from(KINDS),
@@ -53,6 +54,9 @@ MAP_SETS = st.lists(
 
 @given(MAP_SETS)
 @example(MapSet((MapFile("a,b.yaml"), MapFile('"/c"'), MapFile("/d*3")), (1, 2, 1)))
+@example(
+    MapSet((MapFile("a.map@0.5"), MapFile("a.map", 0.5), MapFile("a,b.map", 1e-05)), (1, 2, 1))
+)
 @example(MapSet((MapFile(" a.yaml"), MapFile("maze"), MapFile("maze:7")), (1, 1, 1)))
 @example(MapSet((MapFile("\ud800,.yaml"),), (1,)))
 def test_the_text_of_maps_reads_as_the_same_maps(maps: MapSet) -> None:
@@ -94,6 +98,12 @@ def test_text_is_refused_in_one_line_or_has_one_form(text: str) -> None:
         ),
         ("a b.YML", [MapFile("a b.YML")], "a b.YML"),
         ("x:y.map", [MapFile("x:y.map")], "x:y.map"),
+        (
+            "x/y.map@0.50*3,maze",
+            [MapFile("x/y.map", 0.5), ProjectMap("maze")],
+            "x/y.map@0.5*3,maze",
+        ),
+        ('"a,b.map"@2', [MapFile("a,b.map", 2.0)], '"a,b.map"@2.0'),
         ('"a,b.yaml", maze', [MapFile("a,b.yaml"), ProjectMap("maze")], '"a,b.yaml",maze'),
         ("x" * 5000, [ProjectMap("x" * 5000)], "x" * 5000),
     ],
@@ -172,6 +182,12 @@ def test_a_set_checks_itself_and_values_have_limits() -> None:
         lambda: ProjectMap(" a"),
         lambda: ProjectMap(""),
         lambda: MapFile(""),
+        lambda: MapFile("a.yaml", 0.5),
+        lambda: MapFile("a.map", 0.0),
+        lambda: parse("a.map@0"),
+        lambda: parse("a.map@1e9"),
+        lambda: parse("a.map@1.2.3"),
+        lambda: parse("a.yaml@0.5"),
     ):
         with pytest.raises(ValueError, match=r"map.*expected"):
             make()

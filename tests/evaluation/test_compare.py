@@ -23,7 +23,7 @@ from sqn_jax.evaluation.agents import (
     group_policies,
     with_baselines,
 )
-from sqn_jax.evaluation.compare import load_maps, num_episodes
+from sqn_jax.evaluation.compare import _distinct_names, load_maps, num_episodes
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import (
     OccupancyMap,
@@ -181,6 +181,25 @@ def test_a_map_is_judged_by_each_robot_s_own_radius(tmp_path: Path) -> None:
         load_maps(agents, settings)
 
 
+def test_files_of_one_name_are_told_apart_by_their_folders() -> None:
+    names = {
+        "/x/hall/map.yaml": "map",
+        "/x/yard/map.yaml": "map",
+        "maze": "maze",
+        "/m/maze.yaml": "maze",
+    }
+    assert list(_distinct_names(names).values()) == ["hall/map", "yard/map", "maze", "m/maze"]
+    deeper = {"/a/x/map.yaml": "map", "/b/x/map.yaml": "map", "/b/x/map.map": "map"}
+    assert list(_distinct_names(deeper).values()) == ["a/x/map", "b/x/map.yaml", "x/map.map"]
+    with pytest.raises(ValueError, match="one file twice"):
+        _distinct_names({"/x/map.yaml": "map", "/x/../x/map.yaml": "map"})
+
+
+def test_the_robot_of_an_evaluation_may_have_another_radius() -> None:
+    settings = Settings(maps=("maze",), episodes=1, robot_radius=0.3)
+    assert set(load_maps([BaselineAgent("bug", EnvConfig())], settings)) == {("maze", 0.3)}
+
+
 def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
     run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -246,7 +265,11 @@ def test_a_run_without_a_checkpoint_is_named(
         (["--episodes", "1000000000000"], ["episodes", "1000000000000", "at most"]),
         (["--seed", "2147483647", "--eval-seeds", "2"], ["seed", "2147483647"]),
         (["--maps", "maze", "maze"], ["maps", "maze", "twice"]),
-        (["--maps", "maze", str(MAZE_FILE)], ["maps", "maze.yaml", "both are called 'maze'"]),
+        (
+            ["--maps", str(MAZE_FILE), str(MAZE_FILE.parent / "../maps/maze.yaml")],
+            ["maps", "maze.yaml", "one file twice"],
+        ),
+        (["--robot-radius", "-1"], ["robot_radius", "-1"]),
         (["--goal-radius", "0.3", "0.3"], ["goal_radii", "0.3", "twice"]),
         (["--velocity-noise", "0.1", "0.1"], ["noise", "0.1", "twice"]),
         (["--velocity-noise", "1e39"], ["noise", "1e+39"]),

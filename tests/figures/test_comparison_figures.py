@@ -14,7 +14,7 @@ from matplotlib.text import Text
 
 from sqn_jax import figures
 from sqn_jax.figures.gallery import spread_steps
-from sqn_jax.maps import load_map
+from sqn_jax.maps import OccupancyMap, load_map
 
 
 def rows(rewards: list[Any], successes: list[Any]) -> list[dict[str, Any]]:
@@ -85,6 +85,41 @@ def test_the_gallery_has_a_panel_a_map_in_metres() -> None:
     assert marks == [tuple(point) for point in maps[0].evaluation_points]
     with pytest.raises(ValueError, match="no maps"):
         figures.map_gallery([])
+
+
+def test_a_map_is_drawn_in_the_frame_of_its_file_cell_by_cell() -> None:
+    """6 x 4 cells of 1 m, turned by 90 degrees about (10, 20)."""
+    occupied = np.array(
+        [[letter == "#" for letter in row] for row in ("######", "#..#.#", "#..#.#")]
+    )
+    occupied = np.concatenate([occupied, occupied[:1]])
+    unknown = np.zeros_like(occupied)
+    unknown[0, 5] = True
+    spawn, evaluation = np.array([[1.5, 1.5], [2.5, 2.5]]), np.array([[1.5, 2.5], [2.5, 1.5]])
+    turned = OccupancyMap(
+        "yard", occupied, 1.0, spawn, evaluation, (10.0, 20.0, math.pi / 2), unknown=unknown
+    )
+    figure = figures.map_picture(turned, 0.1)
+    (axes,), (image,) = figure.axes, figure.axes[0].images
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:4] == ["within reach", "free", "unknown", "occupied"]
+    legend = [patch.get_facecolor() for patch in figure.legends[0].get_patches()]
+    kinds = np.array(
+        [
+            [legend.index(color) for color in map(tuple, row)]
+            for row in image.cmap(image.norm(image.get_array()))
+        ]
+    )
+    np.testing.assert_array_equal(
+        kinds, [[3, 3, 3, 3, 3, 2], [3, 0, 0, 3, 1, 3], [3, 0, 0, 3, 1, 3], [3] * 6]
+    )
+    # x of the map frame is 10 - y of the grid, y is 20 + x.
+    np.testing.assert_allclose(axes.lines[0].get_xydata(), [[8.5, 21.5], [7.5, 22.5]])
+    marks = [line.get_xydata()[0] for line in axes.lines[1:]]
+    np.testing.assert_allclose(marks, [[7.5, 21.5], [8.5, 22.5]])
+    np.testing.assert_allclose([*axes.get_xlim(), *axes.get_ylim()], [6, 10, 20, 26])
+    corner = (image.get_transform() - axes.transData).transform((0.0, 4.0))
+    np.testing.assert_allclose(corner, [6.0, 20.0], atol=1e-9)
 
 
 def test_a_pattern_is_the_scan_in_the_robots_frame_with_ahead_to_the_right() -> None:

@@ -45,7 +45,7 @@ PNG = {
 }
 
 _SIDES = (0, 1, 2, 19, 20, 21, 29, 30, 31, 300, 8191, 8192, 8193, 2**20, 2**31 - 1, 2**32 - 1)
-_WIDE = (8191, 8192, 8193, 13_000)  # Squares of these are about the largest that may be read.
+_WIDE = (4095, 4096, 4097, 6_500)  # Squares of these are about the largest that may be read.
 _PNM_KINDS = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"P7", b"Pf", b"PF", b"P0")
 _TOPS = (0, 1, 15, 100, 254, 255, 256, 1000, 65534, 65535, 65536, 2**31, -1)
 _NO_NUMBERS = (b"", b"x", b"1e2", b"+3", b"\xb2", b"0030", b"9" * 40)

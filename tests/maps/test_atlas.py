@@ -64,7 +64,12 @@ def test_no_way_leads_from_one_map_to_another(
 def test_a_map_with_an_open_border_is_closed(maps: list[OccupancyMap]) -> None:
     open_map = dataclasses.replace(maps[0], occupied=maps[0].occupied.copy())
     open_map.occupied[:, 0] = False
-    assert side_by_side([maps[1], open_map], "two").occupied[:, 340].all()
+    two = side_by_side([maps[1], open_map], "two")
+    # The wall stands outside: no free cell is lost.
+    assert two.occupied[:, 342].all()
+    np.testing.assert_array_equal(two.occupied[1:341, 343:683], open_map.occupied)
+    points = open_map.spawn_points + np.array([343, 1]) * open_map.resolution
+    np.testing.assert_allclose(two.spawn_points[-len(points) :], points)
 
 
 def test_points_of_one_map_that_do_not_reach_each_other_are_named(
@@ -123,10 +128,28 @@ def test_the_sheet_is_nearly_square_and_hardly_larger_than_its_maps() -> None:
         assert rows <= columns <= 2 * rows
 
 
+@pytest.mark.parametrize("number", [2, 3])
+def test_larger_cells_are_divided_exactly(maps: list[OccupancyMap], number: int) -> None:
+    coarse = dataclasses.replace(maps[0], resolution=number * 0.05)
+    whole = side_by_side([coarse, maps[1]], "two")
+    assert whole.resolution == 0.05
+    divided = np.kron(coarse.occupied, np.ones((number, number), dtype=bool))
+    np.testing.assert_array_equal(whole.occupied[: 340 * number, : 340 * number], divided)
+    np.testing.assert_array_equal(
+        whole.spawn_points[: len(coarse.spawn_points)], coarse.spawn_points
+    )
+    validate(whole, 0.1)
+
+
 def test_what_cannot_be_laid_out_is_refused(maps: list[OccupancyMap]) -> None:
     with pytest.raises(ValueError, match="no map to lay out"):
         side_by_side([], "none")
-    coarse = dataclasses.replace(maps[0], resolution=0.1)
-    with pytest.raises(ValueError, match=r"maze has cells of 0\.05 m and maze of 0\.1 m"):
+    coarse = dataclasses.replace(maps[0], resolution=0.07)
+    with pytest.raises(
+        ValueError, match=r"maze has cells of 0\.05 m and maze of 0\.07 m.*resample"
+    ):
         side_by_side([maps[0], coarse], "two")
+    huge = dataclasses.replace(maps[0], resolution=5.0)
+    with pytest.raises(ValueError, match=r"34000 x 34000 cells|68000 x 34000 cells"):
+        side_by_side([maps[0], huge], "two")
     assert side_by_side(maps[:1], "one").tiles == (1, 1)

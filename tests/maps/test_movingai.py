@@ -82,3 +82,24 @@ def test_a_file_of_nothing_but_line_ends_needs_little_memory(tmp_path: Path) -> 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such file"):
         load_map(tmp_path / "absent.map")
+
+
+def test_a_scale_behind_the_name_is_that_of_the_cells(tmp_path: Path) -> None:
+    path = tmp_path / "small.map"
+    path.write_text(SOUND)
+    loaded, plain = load_map(f"{path}@0.25"), load_map(path)
+    assert (loaded.resolution, loaded.size_m, loaded.name) == (0.25, (1.75, 1.25), "small")
+    np.testing.assert_array_equal(loaded.occupied, plain.occupied)
+
+
+def test_doors_in_the_outermost_cells_stay_open(tmp_path: Path) -> None:
+    # Three rooms that only the outermost cells join.
+    rows = [".......", ".@@@@@.", "...@...", ".@@@@@.", "......."]
+    path = tmp_path / "ring.map"
+    path.write_text("\n".join(["type octile", "height 5", "width 7", "map", *rows]))
+    loaded = load_map(path)
+    drawn = np.array([[letter == "@" for letter in row] for row in rows[::-1]])
+    np.testing.assert_array_equal(loaded.occupied[1:-1, 1:-1], drawn)
+    assert loaded.occupied.sum() == drawn.sum() + 2 * 9 + 2 * 5
+    # The lower left corner of the file's map stays the origin of its frame.
+    np.testing.assert_allclose(loaded.to_grid_frame([0.0, 0.0]), [1.0, 1.0])

@@ -16,9 +16,9 @@ import pytest
 from image_mutations import PNG, PNM, mutated_png, mutated_pnm, pnm_bytes
 from mutations import MOVINGAI, YAML, mutated_bytes, mutated_movingai, mutated_yaml
 
-from sqn_jax.maps import OccupancyMap, describe, load_map, validate
-from sqn_jax.maps.image import MAX_PIXELS
-from sqn_jax.maps.ros import MAX_PLACE, MAX_RESOLUTION, MIN_RESOLUTION
+from sqn_jax.config.map_names import MAX_RESOLUTION, MIN_RESOLUTION
+from sqn_jax.maps import MAX_CELLS, OccupancyMap, describe, load_map, validate
+from sqn_jax.maps.ros import MAX_PLACE
 
 EXAMPLES = {"YAML": 1500, "MovingAI": 300} | dict.fromkeys([*PNM, *PNG], 200)  # 4,000 in all
 SECONDS = 20.0
@@ -40,7 +40,7 @@ def assert_usable(loaded: OccupancyMap, robot_radius: float) -> None:
     rows, cols = loaded.occupied.shape
     assert rows >= 3
     assert cols >= 3
-    assert rows * cols <= MAX_PIXELS
+    assert rows * cols <= MAX_CELLS
     for edge in (loaded.occupied[[0, -1]], loaded.occupied[:, [0, -1]]):
         assert edge.all()
     assert MIN_RESOLUTION <= loaded.resolution <= MAX_RESOLUTION

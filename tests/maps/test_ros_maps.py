@@ -15,7 +15,7 @@ import pytest
 from map_files import pgm_bytes
 from PIL import Image
 
-from sqn_jax.maps import OccupancyMap, load_map, save_map
+from sqn_jax.maps import OccupancyMap, load_map, points_to_cells, save_map
 
 Room = Callable[..., Path]
 
@@ -29,9 +29,9 @@ def free_bands(path: Path, count: int) -> list[bool]:
     """Whether each band of `blocks` is free, read in the middle of the band."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        occupied = load_map(path).occupied
-    assert occupied.shape == (20, 30 * count)
-    return [not occupied[10, 30 * band + 15] for band in range(count)]
+        loaded = load_map(path)
+    middles = loaded.to_grid_frame([(3.0 * band + 1.55, 1.05) for band in range(count)])
+    return [bool(~loaded.occupied[tuple(cell)]) for cell in points_to_cells(middles, 0.1)]
 
 
 def png_bytes(pixels: np.ndarray, mode: str | None = None) -> bytes:
@@ -45,16 +45,32 @@ def test_the_top_row_of_the_image_is_the_north_edge(room: Room) -> None:
     grey = np.full((20, 50), 254, dtype=np.uint8)
     grey[3, 40] = 0
     loaded = load_map(room(grey=grey))
-    inside = np.argwhere(loaded.occupied[1:-1, 1:-1]) + 1
-    assert inside.tolist() == [[16, 40]]
+    assert np.argwhere(loaded.occupied[1:-1, 1:-1]).tolist() == [[16, 40]]
 
 
-def test_the_border_is_closed(room: Room) -> None:
-    occupied = load_map(room()).occupied
-    assert occupied.shape == (90, 120)
+@pytest.mark.parametrize("yaw", ["0.0", "0.7"])
+def test_an_open_border_gets_a_wall_outside_and_coordinates_stay(room: Room, yaw: str) -> None:
+    loaded = load_map(room(origin=f"[3.0, -2.0, {yaw}]", spawn_points="[[4, 2], [4, 3]]"))
+    occupied = loaded.occupied
+    assert occupied.shape == (92, 122)
     assert occupied[[0, -1]].all()
     assert occupied[:, [0, -1]].all()
     assert not occupied[1:-1, 1:-1].any()
+    # The lower left corner of the image, one cell inside the wall.
+    np.testing.assert_allclose(loaded.to_grid_frame([3.0, -2.0]), [0.1, 0.1], atol=1e-12)
+    np.testing.assert_allclose(loaded.to_map_frame(loaded.spawn_points), [[4, 2], [4, 3]])
+
+
+@pytest.mark.parametrize("side", ["top", "bottom", "left", "right", "none"])
+def test_a_wall_is_added_only_where_a_free_cell_lies_on_the_border(room: Room, side: str) -> None:
+    grey = np.full((40, 60), 254, dtype=np.uint8)
+    grey[[0, -1]] = grey[:, [0, -1]] = 0
+    door = {"top": (0, 9), "bottom": (-1, 9), "left": (9, 0), "right": (9, -1)}
+    if side in door:
+        grey[door[side]] = 254
+    loaded = load_map(room(grey=grey))
+    assert (~loaded.occupied).sum() == (grey == 254).sum()
+    assert loaded.occupied.shape == ((42, 62) if side in door else (40, 60))
 
 
 def test_points_are_given_in_the_map_frame(room: Room) -> None:
@@ -65,9 +81,10 @@ def test_points_are_given_in_the_map_frame(room: Room) -> None:
         evaluation_points="[[9.0, 22.0], [9, 22.5], [7.0, 21.0]]",
     )
     loaded = load_map(path)
-    np.testing.assert_allclose(loaded.spawn_points, [[2.0, 1.0], [10.0, 5.0]])
-    np.testing.assert_allclose(loaded.evaluation_points, [[2.0, 1.0], [2.5, 1.0], [1.0, 3.0]])
-    assert loaded.origin == (10.0, 20.0, math.pi / 2)
+    # And a cell of 0.1 m for the wall around it.
+    np.testing.assert_allclose(loaded.spawn_points, [[2.1, 1.1], [10.1, 5.1]])
+    np.testing.assert_allclose(loaded.evaluation_points, [[2.1, 1.1], [2.6, 1.1], [1.1, 3.1]])
+    np.testing.assert_allclose(loaded.origin, [10.1, 19.9, math.pi / 2])
 
 
 def test_the_own_keys_have_defaults_and_are_read(room: Room) -> None:
@@ -113,13 +130,35 @@ def test_raw_images_hold_percentages_and_ignore_negate(room: Room) -> None:
         assert free_bands(path, 6) == [True, True, False, False, False, False]
 
 
-def test_scale_mode_needs_an_opaque_pixel(room: Room) -> None:
-    pixels = np.stack([blocks(254, 254, 254, 0), blocks(255, 254, 0, 255)], axis=-1)
-    scale = room(image=png_bytes(pixels), mode="scale")
-    assert free_bands(scale, 4) == [True, False, False, False]
-    # Trinary averages alpha in: (254 + 254) / 2 is free, (254 + 0) / 2 and (0 + 255) / 2 are not.
-    trinary = room(image=png_bytes(pixels), mode="trinary")
-    assert free_bands(trinary, 4) == [True, True, False, False]
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@pytest.mark.parametrize("kind", ["LA", "RGBA"])
+def test_what_is_not_wholly_opaque_is_unknown_but_in_raw_mode(
+    room: Room, mode: str, kind: str
+) -> None:
+    grey = 9 if mode == "raw" else 254
+    pixels = np.stack([blocks(grey, grey, grey, 105), blocks(255, 254, 0, 255)], axis=-1)
+    if kind == "RGBA":
+        pixels = pixels[..., [0, 0, 0, 1]]
+    path = room(image=png_bytes(pixels), mode=mode)
+    assert free_bands(path, 4) == [True, mode == "raw", mode == "raw", False]
+
+
+@pytest.mark.parametrize("kind", ["LA", "RGBA", "PA"])
+@pytest.mark.parametrize("negate", ["0", "1"])
+def test_an_opaque_alpha_channel_changes_nothing(room: Room, kind: str, negate: str) -> None:
+    # With alpha averaged in, 205 would be (3 * 205 + 255) / 4 = 217.5 and free.
+    grey = blocks(254, 205, 100, 50, 0)
+    if kind == "PA":  # A palette whose every entry is marked as opaque.
+        image = Image.fromarray(grey)
+        image.putpalette([level for level in range(256) for _ in "rgb"])
+        buffer = io.BytesIO()
+        image.save(buffer, format="PNG", transparency=b"\xff" * 256)
+        data = buffer.getvalue()
+    else:
+        data = png_bytes(grey, kind)
+    free = free_bands(room(image=data, negate=negate), 5)
+    assert free == free_bands(room(grey=grey, negate=negate), 5)
+    assert free == ([True, False, False, False, False] if negate == "0" else [False] * 4 + [True])
 
 
 def test_colour_is_averaged(room: Room) -> None:
@@ -140,7 +179,7 @@ def test_an_image_without_alpha_reads_the_same_in_scale_mode(room: Room) -> None
 
 
 @pytest.mark.parametrize("kind", ["grey", "16 bit", "colour", "palette"])
-def test_a_shade_that_is_marked_as_clear_is_unknown_in_scale_mode(room: Room, kind: str) -> None:
+def test_a_shade_that_is_marked_as_clear_is_unknown(room: Room, kind: str) -> None:
     clear: object = 255
     image = Image.fromarray(blocks(255, 254, 0))
     if kind == "16 bit":
@@ -152,11 +191,8 @@ def test_a_shade_that_is_marked_as_clear_is_unknown_in_scale_mode(room: Room, ki
         image.putpalette([0, 0, 0, 254, 254, 254, 255, 255, 255])
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", transparency=clear)
-    scale = room(image=buffer.getvalue(), mode="scale")
-    assert free_bands(scale, 3) == [False, True, False]
-    # Trinary averages a palette's alpha in: (3 * 255 + 0) / 4 is occupancy 0.25.
-    trinary = room(image=buffer.getvalue(), mode="trinary")
-    assert free_bands(trinary, 3) == [kind != "palette", True, False]
+    for mode in ("scale", "trinary"):
+        assert free_bands(room(image=buffer.getvalue(), mode=mode), 3) == [False, True, False]
 
 
 @pytest.mark.parametrize("kind", ["P1", "P3", "P4", "P6"])
@@ -242,12 +278,131 @@ def test_ordinary_maps_are_not_warned_about(
     assert load_map(room(grey=blocks(*greys), free_thresh=free_thresh)).warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("greys", "free_thresh"),
+    [
+        ((254,) * 9 + (255,), "0.1"),  # a shade of white beside a purer one
+        ((254, 254, 240), "0.25"),  # far lighter than any gray for unknown
+        ((205, 205, 205, 205, 254), "0.25"),  # what is left would be a nook
+    ],
+)
+def test_no_warning_gives_advice_that_makes_a_map_worse(
+    room: Room, greys: tuple[int, ...], free_thresh: str
+) -> None:
+    pixels = blocks(*greys)
+    if greys[-1] == 254:
+        pixels[:, -27:] = 205
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*cells cut to")
+        assert "gray" not in str(load_map(room(grey=pixels, free_thresh=free_thresh)).warnings)
+
+
+def test_the_advice_about_unknown_ground_leaves_the_rest_free(room: Room) -> None:
+    grey = blocks(254, 254, 205, 254)
+    with pytest.warns(UserWarning, match=r"lower free_thresh from 0\.25 to 0\.196"):
+        load_map(room(grey=grey, free_thresh="0.25"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*of the free ground lies outside")
+        assert free_bands(room(grey=grey, free_thresh="0.196"), 4) == [True, True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "P", "RGB"])
+def test_a_bmp_image_is_read(room: Room, kind: str) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(blocks(255, 0, 255)).convert(kind).save(buffer, format="BMP")
+    assert free_bands(room(image=buffer.getvalue()), 3) == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "P", "I;16"])
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+def test_cells_are_those_of_the_gray_that_the_image_library_reads(
+    room: Room, kind: str, mode: str
+) -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.choice(np.array([0, 100, 205, 206, 254, 255], dtype=np.uint8), (20, 60))
+    grey[5:15, 5:55] = 255
+    if kind == "I;16":
+        image = Image.fromarray(grey.astype(np.uint16) * 257)
+        expected = grey
+    else:
+        image = Image.fromarray(grey).convert(kind)
+        expected = np.asarray(image.convert("L"))
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = load_map(room(image=buffer.getvalue(), mode=mode))
+    free = (255 - expected[::-1].astype(float)) / 255 < 0.196
+    np.testing.assert_array_equal(~loaded.occupied[1:-1, 1:-1], free)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("mode", "TRINARY"), ("mode", "Scale"), ("negate", "no"), ("negate", "FALSE")],
+)
+def test_values_are_read_in_every_case_as_map_server_does(
+    room: Room, field: str, value: str
+) -> None:
+    assert free_bands(room(grey=blocks(254, 205, 0), **{field: value}), 3) == [True, False, False]
+
+
+def test_tabs_are_blanks_between_a_key_and_its_value(room: Room) -> None:
+    path = room(origin="[1.0,\t2.0 ,0.0\t]\t# where", resolution='"0.1"\t', free_thresh="0.2\t")
+    path.write_text(path.read_text().replace(": ", ":\t"))
+    plain = load_map(room(origin="[1.0, 2.0, 0.0]", free_thresh="0.2"))
+    path.write_text(path.read_text().replace(": ", ":\t \t"))
+    np.testing.assert_array_equal(load_map(path).occupied, plain.occupied)
+    path.write_text("image:\n\troom.pgm\n")
+    with pytest.raises(ValueError, match="not readable as YAML"):
+        load_map(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "line"),
+    [
+        ("spawn_pionts", "unknown key 'spawn_pionts' (is spawn_points meant?): no effect"),
+        ("Max_Steps", "unknown key 'Max_Steps' (is max_steps meant?): no effect"),
+        ("author", "unknown key 'author': no effect"),
+    ],
+)
+def test_an_unknown_key_is_named_with_the_nearest_known_one(
+    room: Room, key: str, line: str
+) -> None:
+    with pytest.warns(UserWarning, match="unknown key") as caught:
+        load_map(room(**{key: "[[1, 1], [2, 2]]"}))
+    assert [str(warning.message).partition(": ")[2] for warning in caught] == [line]
+
+
+def test_a_required_key_that_is_misspelt_is_found(room: Room) -> None:
+    with pytest.raises(ValueError, match=r"free_thresh: missing \(is 'free_tresh' meant\?\)"):
+        load_map(room(drop="free_thresh", free_tresh="0.2"))
+
+
+@pytest.mark.parametrize("clear", [False, True])
+def test_where_nothing_is_free_the_line_says_why(room: Room, clear: bool) -> None:
+    # Black lines on white, or black ink on clear ground.
+    ink = np.zeros((20, 60), dtype=bool)
+    ink[::4] = True
+    if clear:
+        image = png_bytes(np.stack([np.zeros_like(ink), 255 * ink], axis=-1).astype(np.uint8))
+        words = ["0.0% of the pixels are free", "75.0% are transparent, which means unknown"]
+        words.append("negate: 1 would make 25.0% free")
+        path = room(image=image)
+    else:
+        path = room(grey=np.where(ink, 0, 254), negate="1")
+        words = ["25.0% of the pixels are free (negate: 1", "negate: 0 would make 75.0% free"]
+    with pytest.raises(ValueError, match=r"no cell is free for a robot of radius 0\.1 m") as caught:
+        load_map(path)
+    for word in words:
+        assert word in str(caught.value)
+
+
 def test_an_image_in_a_folder_below_is_found(room: Room, tmp_path: Path) -> None:
-    path = room(image_name="x")
+    path = room()
     (tmp_path / "images").mkdir()
     (tmp_path / "room.pgm").rename(tmp_path / "images" / "grid.pgm")
     path.write_text(path.read_text().replace("room.pgm", "images/grid.pgm"))
-    assert load_map(path).shape == (90, 120)
+    assert load_map(path).shape == (92, 122)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
@@ -282,3 +437,12 @@ def test_saving_where_one_cannot_write_is_one_clear_line(tmp_path: Path) -> None
         save_map(load_map("maze"), tmp_path / "absent" / "m.yaml")
     with pytest.raises(ValueError, match=r"expected a path ending in \.yaml"):
         save_map(load_map("maze"), tmp_path / "m.png")
+
+
+def test_unknown_ground_is_told_from_obstacles(room: Callable[..., Path]) -> None:
+    grey = np.full((90, 120), 254, dtype=np.uint8)
+    assert load_map(room(grey=grey)).unknown is None
+    grey[:5, :10], grey[10, 20:40] = 205, 0
+    unknown = load_map(room(grey=grey)).unknown
+    assert unknown is not None
+    np.testing.assert_array_equal(unknown, np.pad(grey[::-1] == 205, 1))
