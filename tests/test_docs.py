@@ -21,6 +21,7 @@ from rooms import write_empty_room
 
 from experiments import robustness, table1
 from sqn_jax import report
+from sqn_jax import tasks as suites_of_tasks
 from sqn_jax.cli import main
 from sqn_jax.config.map_names import MapFile, ProjectMap, parse
 from sqn_jax.config.presets import PRESETS
@@ -195,7 +196,7 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Put an end to every command where it would begin to compute."""
     policy_of = pretrained.find_policy
 
-    def find_policy(name: str, checkpoint: int | str = "newest") -> Policy:
+    def find_policy(name: str, checkpoint: int | str = "newest", params: str = "shipped") -> Policy:
         if not pretrained.names_a_run(name):
             return policy_of(name, checkpoint)
         RunFolder.open(Path(name))
@@ -210,6 +211,9 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def evaluate_session(agents: Any, settings: Any, out: Path | None) -> None:
         named_maps_exist(*settings.maps)
+        raise Begun
+
+    def read_suite(file: Path) -> None:
         raise Begun
 
     def render_session(policies: Any, out: Path, *, map_name: str, **_: Any) -> None:
@@ -235,7 +239,7 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, function in (
         *((pretrained, find_policy), (train, train_session), (evaluate, evaluate_session)),
         *((render, render_session), (report, write_report), (report, read_runs)),
-        *((table1, prepare), (robustness, prepare)),
+        *((table1, prepare), (robustness, prepare), (suites_of_tasks, read_suite)),
     ):
         monkeypatch.setattr(module, function.__name__, function)
 

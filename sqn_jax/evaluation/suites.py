@@ -99,7 +99,7 @@ class SuiteMaps:
     """The maps of a suite by name, each loaded once, while they fit into some memory."""
 
     def __init__(self, load: LoadMap, cells: int = 2**28) -> None:
-        """`cells` bounds the maps that stay in memory; others are loaded again when they are needed."""
+        """`cells` bounds the maps that stay in memory; others are loaded again when needed."""
         self._load, self._left = load, cells
         self._loaded: dict[str, OccupancyMap] = {}
 

@@ -73,12 +73,13 @@ def kind_of(mode: int) -> str:
     return _KINDS.get(stat.S_IFMT(mode), "a special file")
 
 
-def no_file(path: Path) -> str:
-    """What stands in the place of a file that is none: nothing, a folder, or a pipe, say."""
+def no_file(path: Path) -> str | None:
+    """What stands in the place of a file that is none: a folder or a pipe, say; None for a file."""
     try:
-        return f"is {kind_of(path.stat().st_mode)}"
-    except (OSError, ValueError):
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return "no such file"
+    return None if stat.S_ISREG(mode) else f"is {kind_of(mode)}"
 
 
 def read_at_most(path: Path, limit: int, expected: str, *, follow: bool = True) -> bytes:
@@ -94,13 +95,13 @@ def read_at_most(path: Path, limit: int, expected: str, *, follow: bool = True) 
         ValueError: one line naming the file: there is none, it cannot be read, or it is larger.
     """
     try:
+        if (place := no_file(path)) is not None:
+            raise ValueError(f"{named(path)}: {place}, expected {expected}")
         with os.fdopen(open_regular(path, follow=follow), "rb") as file:
             size = os.fstat(file.fileno()).st_size
             if size > limit:
                 raise ValueError(f"{named(path)}: larger than {limit} bytes, expected {expected}")
             return file.read(size)
-    except FileNotFoundError:
-        raise ValueError(f"{named(path)}: no such file, expected {expected}") from None
     except OSError as error:
         raise ValueError(f"{named(path)}: cannot be read ({error.strerror})") from None
 

@@ -299,11 +299,11 @@ def test_fields_left_out_take_their_defaults() -> None:
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (None, "cannot be read"),
+        (None, "no such file"),
         (b"{", "not valid JSON"),
         (b"", "not valid JSON"),
         (b'{"seed": -1}', "seed is -1"),
-        (b'{"learner": {"discount": NaN}}', "learner.discount is nan"),
+        (b'{"learner": {"discount": NaN}}', "NaN is no number"),
         (b"[]", "config is"),
     ],
 )

@@ -37,7 +37,7 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
     assert_refused(tmp_path / "none.yaml", "none.yaml", "no such file")
     (tmp_path / "folder.yaml").mkdir()
-    assert_refused(tmp_path / "folder.yaml", "folder.yaml: a folder")
+    assert_refused(tmp_path / "folder.yaml", "folder.yaml: is a folder")
     assert_refused(tmp_path / ("x" * 300 + ".yaml"), "cannot be read")
 
 
@@ -173,9 +173,9 @@ def test_a_pipe_is_refused_and_not_waited_for(room: Room, tmp_path: Path) -> Non
     (tmp_path / "room.pgm").unlink()
     for name in ("room.pgm", "pipe.yaml", "pipe.map"):
         os.mkfifo(tmp_path / name)
-    assert_refused(path, "image", "not a regular file")
-    assert_refused(tmp_path / "pipe.yaml", "pipe.yaml: not a regular file")
-    assert_refused(tmp_path / "pipe.map", "pipe.map: not a regular file")
+    assert_refused(path, "image", "is a pipe")
+    assert_refused(tmp_path / "pipe.yaml", "pipe.yaml: is a pipe")
+    assert_refused(tmp_path / "pipe.map", "pipe.map: is a pipe")
 
 
 def test_a_cell_too_small_to_reckon_with_is_refused_for_a_robot_of_no_size(room: Room) -> None:

@@ -92,8 +92,9 @@ def test_an_evaluation_that_does_not_fit_is_refused_before_it_or_its_run_begins(
     agents = with_baselines([], baselines=True)
     settings = Settings(maps=("maze",), episodes=1_000, max_steps=50)
     program = Program(PRESETS["paper"], 400, 5)
-    # Both agents under 5 seeds for 2 radii, 1 kB each; x, y and heading of 50 steps twice.
-    expected = 2 * 5 * 1_000 * 2 * 1_000 + 2 * 50 * 1_000 * 3 * 4
+    # Both agents under 5 seeds for 2 radii, 1 kB each; x, y and heading of 50 steps twice, for the
+    # 2,000 episodes that are there at once.
+    expected = 2 * 5 * 1_000 * 2 * 1_000 + 2 * 50 * 2_000 * 3 * 4
     assert memory_bytes(agents, load_maps(agents, settings), settings) == expected
     monkeypatch.setattr(memory_budget, "available_bytes", lambda: expected - 1.0)
     with pytest.raises(ValueError, match=r"keeping the episodes .* lower one of --episodes, "):
