@@ -133,8 +133,12 @@ def test_a_run_stopped_by_a_signal_and_resumed_equals_one_never_stopped(
     assert not (broken / "summary.json").exists()
 
     # A row written after the last checkpoint is dropped, not doubled.
+    rows = (broken / "metrics.jsonl").read_text().splitlines()
     with (broken / "metrics.jsonl").open("a") as file:
-        file.write(json.dumps({"chunk": 2, "wall_seconds": 0.0, "steps_per_second": 0}) + "\n")
+        first = json.loads(rows[0])
+        counted = {name: 2 * first[name] for name in ("chunk", "episodes", "env_steps")}
+        second = {**first, **counted, "wall_seconds": 0.0}
+        file.write(json.dumps(second) + "\n")
     assert main(["train", "--resume", "--run-dir", str(broken)]) == 0
     assert metrics_of(broken) == metrics_of(straight)
     assert [row["chunk"] for row in metrics_of(broken)] == [1, 2]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rooms import write_empty_room
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.cli import main
@@ -36,24 +37,44 @@ from sqn_jax.maps import (
 from sqn_jax.policies.run_policies import Policy, load_policy
 
 TINY = ["--preset", "smoke", "--env.max-steps", "30", "--eval.episodes", "4", "--num-seeds", "2"]
-AS_TRAINED = ["--maps", "maze", "--max-steps", "30"]
 EPISODES, EVAL_SEEDS = 3, 2
 MAZE_FILE = Path(__file__).resolve().parents[2] / "maps" / "maze.yaml"
 
 
 @pytest.fixture(scope="module")
-def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map on which shortest paths are found in little time, with enough places for tasks."""
+    path = write_empty_room(tmp_path_factory.mktemp("map"))
+    text = path.read_text()
+    corners = "evaluation_points: [[0.8, 0.8], [4.2, 3.2]"
+    assert corners in text
+    text = text.replace(corners, f"{corners}, [0.8, 3.2], [4.2, 0.8], [2.5, 2.0]")
+    path.write_text(text + "max_steps: 40\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def as_trained(room: Path) -> list[str]:
+    """Words of `evaluate`: the map and the episodes that the tiny run was trained on."""
+    return ["--maps", str(room), "--max-steps", "30"]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory, room: Path) -> Path:
     """Two training seeds side by side, moved away from where they were trained."""
     folder = tmp_path_factory.mktemp("runs")
-    assert main(["train", *TINY, "--run-dir", str(folder / "here")]) == 0
+    words = ["train", *TINY, "--map", str(room), "--run-dir", str(folder / "here")]
+    assert main(words) == 0
     shutil.move(folder / "here", folder / "elsewhere")
     return folder / "elsewhere"
 
 
 @pytest.fixture(scope="module")
-def evaluated(run_dir: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def evaluated(
+    run_dir: Path, as_trained: list[str]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Results and records of the tiny run and the references, with and without noise."""
-    words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", str(EPISODES)]
+    words = ["evaluate", str(run_dir), *as_trained, "--episodes", str(EPISODES)]
     words += ["--eval-seeds", str(EVAL_SEEDS), "--velocity-noise", "0.2", "--range-noise", "0.4"]
     assert main([*words, "--out", str(run_dir.parent / "found.json")]) == 0
     found = json.loads((run_dir.parent / "found.json").read_text())
@@ -99,9 +120,11 @@ def test_every_agent_meets_the_same_tasks_under_every_noise(
     assert len({places.pop() for places in tasks.values()}) == EVAL_SEEDS * EPISODES
 
 
-def test_the_policy_is_the_one_the_training_ended_with(run_dir: Path, tmp_path: Path) -> None:
+def test_the_policy_is_the_one_the_training_ended_with(
+    run_dir: Path, as_trained: list[str], tmp_path: Path
+) -> None:
     """The same episodes as in the run's own evaluation, from the run folder alone."""
-    words = ["evaluate", str(run_dir), *AS_TRAINED, "--episodes", "4", "--eval-seeds", "1"]
+    words = ["evaluate", str(run_dir), *as_trained, "--episodes", "4", "--eval-seeds", "1"]
     words += ["--goal-radius", "0.3", "--tasks", "points", "pairs", "--no-baselines"]
     assert main([*words, "--out", str(tmp_path / "again.json")]) == 0
     again = [json.loads(line) for line in (tmp_path / "again.jsonl").read_text().splitlines()]
@@ -154,13 +177,13 @@ def test_the_shortest_paths_are_read_off_each_goal_s_own_field(
 
 
 def test_the_step_limit_is_the_map_s_whatever_the_run_was_trained_with(
-    run_dir: Path, tmp_path: Path
+    run_dir: Path, room: Path, tmp_path: Path
 ) -> None:
-    words = ["evaluate", str(run_dir), "--maps", "column", "--episodes", "1", "--eval-seeds", "1"]
+    words = ["evaluate", str(run_dir), "--maps", str(room), "--episodes", "1", "--eval-seeds", "1"]
     assert main([*words, "--no-baselines", "--out", str(tmp_path / "found.json")]) == 0
     lines = (tmp_path / "found.jsonl").read_text().splitlines()
     failures = [record for record in map(json.loads, lines) if not record["success"]]
-    assert {record["time_steps"] for record in failures} == {load_map("column").max_steps}
+    assert {record["time_steps"] for record in failures} == {40}
 
 
 def test_a_map_is_judged_by_each_robot_s_own_radius(tmp_path: Path) -> None:
@@ -229,13 +252,15 @@ def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(
     assert "config.json: is a file of that run" in refusal([str(run_dir), "--out", str(out)])
 
 
-def test_a_damaged_array_of_a_checkpoint_is_one_line(run_dir: Path, tmp_path: Path) -> None:
+def test_a_damaged_array_of_a_checkpoint_is_one_line(
+    run_dir: Path, as_trained: list[str], tmp_path: Path
+) -> None:
     """In a process of its own: Orbax complains later of what it left running when it failed."""
     shutil.copytree(run_dir, tmp_path / "run")
     arrays = (tmp_path / "run" / "checkpoints").rglob("target_params/**/d/*")
     for file in [file for file in arrays if file.stat().st_size > 10_000]:
         file.write_bytes(b"")
-    words = ["evaluate", str(tmp_path / "run"), "--maps", "maze", "--episodes", "1"]
+    words = ["evaluate", str(tmp_path / "run"), *as_trained, "--episodes", "1"]
     program = [sys.executable, "-m", "sqn_jax", *words]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2

@@ -133,7 +133,7 @@ def test_a_robot_stepped_by_hand_meets_the_tasks_and_the_noise_of_the_policies(
     np.testing.assert_allclose(actors.env_state.pose, trajectory.poses[-1], atol=1e-4)
 
 
-@pytest.mark.parametrize("unit", ["relative", "absolute"])
+@pytest.mark.parametrize("unit", ["relative", pytest.param("absolute", marks=pytest.mark.long)])
 def test_noise_set_afterwards_is_the_noise_of_a_world_made_with_it(unit: Any) -> None:
     config = EnvConfig(velocity_noise_unit=unit, range_noise_unit=unit, max_steps=5)
     made = make_env("maze", dataclasses.replace(config, velocity_noise=0.3, range_noise=0.4))

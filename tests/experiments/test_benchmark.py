@@ -128,6 +128,7 @@ def test_the_learner_is_timed_for_every_agent_and_program(agents: tuple[Any, ...
         assert told["torch_td_error_difference"] < 1e-4
 
 
+@pytest.mark.long
 def test_the_pieces_of_a_step_add_up_to_the_step_itself() -> None:
     """Not in time, which is noisy, but in what they do: each leaves the robot where a step does."""
     room = small_room(12)
@@ -187,7 +188,9 @@ def test_without_pytorch_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> No
     assert "\n" not in told
 
 
-@pytest.mark.parametrize(("method", "num_seeds"), [("pqn", 2), ("r2d2", 1)])
+@pytest.mark.parametrize(
+    ("method", "num_seeds"), [("pqn", 2), pytest.param("r2d2", 1, marks=pytest.mark.long)]
+)
 def test_training_is_timed_with_rollouts_and_updates(method: Any, num_seeds: int) -> None:
     config = tiny_config(method=method, num_seeds=num_seeds)
     with compiling_quickly():

@@ -121,7 +121,9 @@ def end_at_once(process: subprocess.Popen[str], upon: str, number: signal.Signal
     return out
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_a_signal_in_compilation_ends_a_run_that_starts_again_from_the_beginning(
     tiny: TinyRuns, number: signal.Signals
 ) -> None:

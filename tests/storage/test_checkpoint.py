@@ -147,7 +147,7 @@ def files_of(step: Path) -> list[Path]:
     return sorted(path.relative_to(step) for path in step.rglob("*") if path.is_file())
 
 
-DAMAGE = [flip, cut, delete, pytest.param(grow, marks=pytest.mark.long)]
+DAMAGE = [flip, *(pytest.param(damage, marks=pytest.mark.long) for damage in (cut, delete, grow))]
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -181,7 +181,7 @@ def test_any_damaged_file_is_named_and_the_older_checkpoint_taken(
         assert_same(checkpoints.restore(shapes)[0], states[2])
 
 
-@pytest.mark.parametrize("damage", [flip, delete])
+@pytest.mark.parametrize("damage", [pytest.param(flip, marks=pytest.mark.long), delete])
 def test_a_policy_is_read_from_sound_files_or_not_at_all(
     damage: Callable[[Path, np.random.Generator], None], folder: Path, states: list[RunnerState]
 ) -> None:

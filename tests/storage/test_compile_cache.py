@@ -391,7 +391,7 @@ def test_an_evaluation_keeps_its_programs_too(
     with compiling_quickly():
         assert main(["evaluate", *words]) == 0
     assert "compiled programs" not in capsys.readouterr().err
-    assert any(path.name.startswith("jit_start_by_hand-") for path in entries(folder))
+    assert any(path.name.startswith("jit__start_by_hand-") for path in entries(folder))
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])

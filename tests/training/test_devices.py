@@ -20,6 +20,7 @@ from sqn_jax.agent import shards
 from sqn_jax.agent.learner import policy_params
 from sqn_jax.config import LearnerConfig, NetworkConfig, ReplayConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
+from sqn_jax.env import EnvParams
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.training import devices, loop
@@ -40,6 +41,12 @@ def mesh() -> Mesh:
     chosen = devices.choose(config_for("pqn"), 2)
     assert chosen is not None
     return chosen
+
+
+@pytest.fixture(scope="module")
+def world() -> EnvParams:
+    """One for all runs, so that a run is started by the same compiled program in every test."""
+    return small_room(LENGTH, velocity_noise=0.2, range_noise=0.2)
 
 
 def config_for(method: Any, **changes: Any) -> TrainConfig:
@@ -102,12 +109,17 @@ def test_items_are_fetched_from_whichever_device_holds_them(mesh: Mesh, dtype: A
 
 @pytest.mark.parametrize(
     ("method", "num_seeds"),
-    [("pqn", 1), ("r2d2", 1), pytest.param("r2d2", 2, marks=pytest.mark.long)],
+    [
+        pytest.param("pqn", 1, marks=pytest.mark.long),
+        ("r2d2", 1),
+        pytest.param("r2d2", 2, marks=pytest.mark.long),
+    ],
 )
-def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_seeds: int) -> None:
+def test_two_devices_make_the_run_that_one_makes(
+    mesh: Mesh, world: EnvParams, method: Any, num_seeds: int
+) -> None:
     """To the rounding of sums: the same tasks, actions, noise and drawn episodes."""
     config = config_for(method, num_seeds=num_seeds)
-    world = small_room(LENGTH, velocity_noise=0.2, range_noise=0.2)
     found = []
     for chosen in (None, mesh):
         program = make_program(world, config, chosen)
@@ -134,10 +146,9 @@ def test_two_devices_make_the_run_that_one_makes(mesh: Mesh, method: Any, num_se
 
 @pytest.mark.parametrize("method", ["pqn", "r2d2"])
 def test_a_run_saved_on_two_devices_goes_on_and_is_evaluated_on_one(
-    mesh: Mesh, method: Any, tmp_path: Path
+    mesh: Mesh, world: EnvParams, method: Any, tmp_path: Path
 ) -> None:
     config = config_for(method)
-    world = small_room(LENGTH)
     one, both = (make_program(world, config, chosen) for chosen in (None, mesh))
     runner = loop.start_run(world, both)
     with Checkpoints(tmp_path, Origin(config)) as checkpoints:

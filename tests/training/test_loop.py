@@ -65,13 +65,15 @@ def small_paper() -> TrainConfig:
 
 
 def small_quick() -> TrainConfig:
-    """The quick preset with robots for one minibatch and two windows; else unchanged."""
+    """The quick preset with robots for one minibatch and two short windows; else unchanged."""
     quick = PRESETS["quick"]
+    learner = dataclasses.replace(quick.learner, window_length=12)
     return dataclasses.replace(
         quick,
         num_envs=quick.learner.batch_size,
         total_episodes=quick.learner.batch_size * quick.rounds_per_chunk,
-        env=dataclasses.replace(quick.env, max_steps=2 * quick.learner.window_length or 24),
+        env=dataclasses.replace(quick.env, max_steps=2 * learner.window_length),
+        learner=learner,
     )
 
 
