@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.env.geometry import wrap_angle
-from sqn_jax.maps.distance import clear_moves, goal_fields
+from sqn_jax.maps.distance import MAX_SEARCHED_CELLS, clear_moves, goal_fields, is_searchable
 from sqn_jax.maps.occupancy import OccupancyMap, points_to_cells, traversable
 
 MOVES = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if math.gcd(i, j) == 1]
@@ -30,7 +30,12 @@ def shortest_path_lengths(
     *,
     robot_radius: float,
 ) -> NDArray[np.float64]:
-    """Length of the shortest path from each start [E, >= 2] to its goal [E, 2], m."""
+    """Length of the shortest path from each start [E, >= 2] to its goal [E, 2], m.
+
+    Raises:
+        ValueError: the map is too large, see `has_paths`.
+    """
+    require_paths(occupancy_map, "to search paths on")
     resolution = occupancy_map.resolution
     free = traversable(occupancy_map.occupied, resolution, robot_radius)
     row, col = points_to_cells(starts[:, :2], resolution).T
@@ -38,6 +43,24 @@ def shortest_path_lengths(
     for same, field in goal_fields(free, resolution, goals):
         lengths[same] = field[row[same], col[same]]
     return lengths
+
+
+def has_paths(occupancy_map: OccupancyMap) -> bool:
+    """Whether a map has few enough free cells for paths to be searched on it."""
+    return is_searchable(~occupancy_map.occupied)
+
+
+def require_paths(occupancy_map: OccupancyMap, what: str) -> None:
+    """Refuse what needs paths on a map that is too large for that.
+
+    Raises:
+        ValueError: one line naming the map.
+    """
+    if not has_paths(occupancy_map):
+        raise ValueError(
+            f"map {occupancy_map.name}: {np.count_nonzero(~occupancy_map.occupied):,} free cells, "
+            f"expected at most {MAX_SEARCHED_CELLS:,} {what}"
+        )
 
 
 class ShortestPaths:

@@ -16,15 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines.shortest_paths import shortest_path_lengths
+from sqn_jax.baselines.shortest_paths import has_paths, require_paths, shortest_path_lengths
 from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
-from sqn_jax.maps import load_map, step_warning
+from sqn_jax.maps import OccupancyMap, load_map, step_warning
 
 EPISODES_AT_ONCE = 2_000
 """Episodes of each policy whose results are held at once, unless one evaluation seed has more."""
+
+Floats = NDArray[np.floating]
 
 OnEvaluated = Callable[[EpisodeBatch], object]
 """Called with the episodes of a training seed in a world under an evaluation seed."""
@@ -84,6 +86,8 @@ def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
         loaded = load_map(name, robot_radius=radius)
         if loaded.tiles != (1, 1):
             raise ValueError(f"map {name}: several, expected one for an evaluation")
+        if any(agent.algorithm == "oracle" for agent in agents):
+            require_paths(loaded, "for the oracle to plan on (--no-baselines leaves it out)")
         maps[name, radius] = loaded
         if settings.max_steps == 0 and isinstance(parse(name).names[0], MapFile):
             step_length = robot.forward_speed * robot.time_step
@@ -160,7 +164,7 @@ def evaluate_agents(
     # Whole trajectories come to the host only where somebody looks at them.
     needed = () if on_evaluated is None else tuple(dict.fromkeys(("poses", "goals", *fields)))
     for robot in dict.fromkeys(robots.values()):
-        paths: dict[bytes, NDArray[np.float64]] = {}
+        paths: dict[bytes, NDArray[np.float64] | None] = {}
         for world in worlds(robot, maps, settings):
             actors = [agent for agent in agents if robots[agent.name] == robot]
             evaluated: dict[str, list[EpisodeBatch]] = {agent.name: [] for agent in actors}
@@ -194,13 +198,13 @@ def _batches(
     agent: Agent,
     world: World,
     settings: Settings,
-    paths: dict[bytes, NDArray[np.float64]],
+    paths: dict[bytes, NDArray[np.float64] | None],
     on_batch: OnBatch,
     fields: Sequence[str],
 ) -> Iterator[EpisodeBatch]:
     """The episodes of all training seeds under all evaluation seeds.
 
-    `paths` caches the lengths of the shortest paths, m, by task.
+    `paths` caches the lengths of the shortest paths, m, by task; None where they are not searched.
     """
     robot_radius = world.env_params.config.robot_radius
     eval_seeds = settings.all_eval_seeds
@@ -212,9 +216,7 @@ def _batches(
         for (eval_seed, training_seed), (metrics, starts, goals, trajectory) in of_seeds:
             tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
             if tasks not in paths:
-                paths[tasks] = shortest_path_lengths(
-                    world.occupancy_map, starts, goals, robot_radius=robot_radius
-                )
+                paths[tasks] = _shortest_paths(world.occupancy_map, starts, goals, robot_radius)
             yield EpisodeBatch(
                 agent=agent,
                 world=world,
@@ -226,6 +228,15 @@ def _batches(
                 shortest_paths=paths[tasks],
                 trajectory=trajectory,
             )
+
+
+def _shortest_paths(
+    occupancy_map: OccupancyMap, starts: Floats, goals: Floats, robot_radius: float
+) -> NDArray[np.float64] | None:
+    """[E] m; None on a map that is too large to search paths on."""
+    if not has_paths(occupancy_map):
+        return None
+    return shortest_path_lengths(occupancy_map, starts, goals, robot_radius=robot_radius)
 
 
 def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.distance import goal_fields
+from sqn_jax.maps.distance import MAX_SEARCHED_CELLS, goal_fields, is_searchable
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     connected_components,
@@ -66,9 +66,13 @@ def describe(
         f"max steps      {occupancy_map.max_steps}",
         f"evaluation     {len(occupancy_map.evaluation_points)} points",
     ]
-    geodesic, straight = evaluation_distances(occupancy_map, robot_radius)
-    lines += _pair_lines(occupancy_map, geodesic, straight)
-    warnings = occupancy_map.warnings + _step_warnings(occupancy_map, geodesic, step_length)
+    warnings = occupancy_map.warnings
+    if is_searchable(used):
+        geodesic, straight = evaluation_distances(occupancy_map, robot_radius)
+        lines += _pair_lines(occupancy_map, geodesic, straight)
+        warnings += _step_warnings(occupancy_map, geodesic, step_length)
+    else:
+        lines.append(f"               (more than {MAX_SEARCHED_CELLS:,} free cells: no distances)")
     lines += [f"warning        {line}" for line in warnings] or ["warnings       none"]
     return "\n".join(lines)
 

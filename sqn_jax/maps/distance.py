@@ -23,8 +23,15 @@ _HALF_MOVES = (
 # Cells this near to a goal get their straight distance if nothing stands around: close by, the few
 # directions of the grid would be felt most.
 _NEAR_CELLS = 12
+MAX_SEARCHED_CELLS = 2**22
+"""Free cells of a map on which paths are searched: the graph of so many takes about 4 GB."""
 FIELD_CELLS = 8_000_000
 """Cells of distance fields that `goal_fields` computes at once."""
+
+
+def is_searchable(free: NDArray[np.bool_]) -> bool:
+    """Whether a map [H, W] has few enough free cells for paths to be searched on it."""
+    return int(np.count_nonzero(free)) <= MAX_SEARCHED_CELLS
 
 
 def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:

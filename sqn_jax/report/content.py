@@ -11,6 +11,7 @@ from typing import Any
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.presets import PRESETS
+from sqn_jax.baselines.shortest_paths import require_paths
 from sqn_jax.evaluation.agents import (
     EpisodeBatch,
     TrainedAgent,
@@ -98,6 +99,8 @@ def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) 
             raise ValueError(f"{count} runs are called {name!r}, expected different names")
     agents = with_baselines(trained, baselines=baselines)
     maps = load_maps(agents, settings)
+    for occupancy_map in maps.values():
+        require_paths(occupancy_map, "for a report, whose pictures show the way left")
     fields = ("info", "output")
     needed = memory_bytes(agents, maps, settings, fields)
     memory_budget.require(needed, "keeping the episodes", "evaluate")

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sqn_jax.baselines.shortest_paths import require_paths
 from sqn_jax.evaluation.agents import Agent
 from sqn_jax.evaluation.compare import (
     RECORD_BYTES,
@@ -96,6 +97,9 @@ def evaluate_suite_session(
         check_tasks(
             suite, maps[radius], robot_radius=radius, source=str(source) if source else None
         )
+        for task in suite.tasks:
+            if task.shortest_path is None or any(agent.algorithm == "oracle" for agent in agents):
+                require_paths(maps[radius](task.map_file), "where a shortest path is searched")
     with episodes_bar(episodes) as bar:
         evaluation, records = evaluate_suite(agents, suite, maps, settings, bar.update)
     if out is not None:

@@ -14,8 +14,14 @@ import pytest
 from map_files import pgm_bytes
 from PIL import ImageFile
 
+from sqn_jax.baselines.shortest_paths import has_paths, shortest_path_lengths
+from sqn_jax.config import EnvConfig
+from sqn_jax.evaluation.agents import BaselineAgent, with_baselines
+from sqn_jax.evaluation.compare import load_maps
+from sqn_jax.evaluation.settings import Settings
+from sqn_jax.maps import distance, load_map
 from sqn_jax.maps import image as image_module
-from sqn_jax.maps import load_map
+from sqn_jax.maps.check import describe
 
 Room = Callable[..., Path]
 
@@ -32,6 +38,23 @@ def assert_refused(path: Path | str, *words: str) -> None:
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     assert_refused("labyrinth", "unknown map 'labyrinth'", "maze", ".yaml")
+
+
+def test_paths_are_not_searched_on_a_map_too_large_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The graph of 16 million free cells takes some 18 GB."""
+    monkeypatch.setattr(distance, "MAX_SEARCHED_CELLS", 20_000)
+    maze = load_map("maze")
+    assert "no distances" in describe(maze)
+    assert not has_paths(maze)
+    with pytest.raises(ValueError, match=r"map maze: \d+,\d+ free cells, expected at most"):
+        shortest_path_lengths(maze, np.ones((1, 3)), np.ones((1, 2)), robot_radius=0.1)
+    settings = Settings(maps=("maze",))
+    with pytest.raises(ValueError, match="for the oracle to plan on"):
+        load_maps(with_baselines([], baselines=True), settings)
+    bug = BaselineAgent("bug", EnvConfig())
+    assert load_maps([bug], settings)
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
