@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from sqn_jax import config as configs
+from sqn_jax.baselines.shortest_paths import require_paths
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.presets import PRESETS
-from sqn_jax.baselines.shortest_paths import require_paths
 from sqn_jax.evaluation.agents import (
     EpisodeBatch,
     TrainedAgent,
