@@ -22,6 +22,7 @@ from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
+from sqn_jax.training import memory_budget
 
 EPISODES_AT_ONCE = 2_000
 """Episodes of each policy whose results are held at once, unless one evaluation seed has more."""
@@ -166,6 +167,7 @@ def evaluate_agents(
     for robot in dict.fromkeys(robots.values()):
         paths: dict[bytes, NDArray[np.float64] | None] = {}
         for world in worlds(robot, maps, settings):
+            memory_budget.bound_programs()
             actors = [agent for agent in agents if robots[agent.name] == robot]
             evaluated: dict[str, list[EpisodeBatch]] = {agent.name: [] for agent in actors}
             for agent in actors:

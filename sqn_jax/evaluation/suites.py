@@ -28,6 +28,7 @@ from sqn_jax.evaluation.agents import Agent, BaselineAgent, OnBatch, TrainedAgen
 from sqn_jax.evaluation.episodes import EpisodeResults, GivenTasks
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.tasks.suite import Task, TaskSuite
+from sqn_jax.training import memory_budget
 
 LoadMap = Callable[[str], OccupancyMap]
 """Makes a map of `Task.map_file`; the same for the same name."""
@@ -144,6 +145,7 @@ def evaluate_suite(
     robots = {agent.name: robot_for(agent.env_config, suite) for agent in agents}
     for robot in dict.fromkeys(robots.values()):
         for chunk in chunks(suite, robot, maps[robot.robot_radius], settings.noise):
+            memory_budget.bound_programs()
             for agent in agents:
                 if robots[agent.name] == robot:
                     results = run_chunk(agent, chunk, settings, on_batch)

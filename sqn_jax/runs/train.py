@@ -84,6 +84,7 @@ def train_session(
         Interrupted: a signal stopped the run; the current chunk was finished and saved.
     """
     require_usable(run_dir)
+    memory_budget.bound_programs()
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)

@@ -81,3 +81,19 @@ def _free_of_group() -> float | None:
         used = float((group / "memory.current").read_text(encoding="ascii"))
         return most - used
     return None
+
+
+MAX_MAPPINGS = 20_000
+"""Memory mappings of a process above which compiled programs are given back. A program holds about
+six; Linux gives a process 65,530, and LLVM crashes for want of more."""
+MAPPINGS = Path("/proc/self/maps")
+
+
+def bound_programs() -> None:
+    """Forget the compiled programs of this process where there are very many.
+
+    A process that trains or evaluates on hundreds of maps, one after the other, would otherwise
+    come to the system's limit. What is needed again is compiled again.
+    """
+    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MAX_MAPPINGS:
+        jax.clear_caches()

@@ -86,6 +86,19 @@ def test_a_gpu_that_jax_cannot_use_is_worth_a_line(
     assert told.count("\n") == 1
 
 
+def test_programs_are_given_back_before_a_process_has_too_many_mappings(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    cleared: list[bool] = []
+    monkeypatch.setattr(memory_budget.jax, "clear_caches", lambda: cleared.append(True))
+    monkeypatch.setattr(memory_budget, "MAPPINGS", tmp_path / "maps")
+    memory_budget.bound_programs()  # Not Linux.
+    for lines, expected in ((20_000, []), (20_001, [True])):
+        (tmp_path / "maps").write_text("7f00-7f01 r-xp\n" * lines)
+        memory_budget.bound_programs()
+        assert cleared == expected
+
+
 def test_an_evaluation_that_does_not_fit_is_refused_before_it_or_its_run_begins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
