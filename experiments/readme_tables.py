@@ -112,7 +112,25 @@ def quick() -> str:
     return markdown_table(["500 greedy episodes on the maze", "success", "steps", "SPL"], rows)
 
 
-TABLES = {each.__name__: each for each in (agents, policies, quick, seeds, paper, dead_ends, noise)}
+def external() -> str:
+    """Policies and baselines on suites from elsewhere: success, and the worst tenth of the maps."""
+    suites = recorded("external.json")["suites"]
+    names = [row["agent"] for row in next(iter(suites.values()))]
+    rows = [
+        [f"{suite} ({rows[0]['num_tasks']} tasks)", *(_with_worst(row) for row in rows)]
+        for suite, rows in suites.items()
+    ]
+    return markdown_table(["success, worst tenth", *names], rows)
+
+
+def _with_worst(row: Entry) -> str:
+    return f"{row['success']['mean']:.2f}, {row['worst_tenth']:.2f}"
+
+
+TABLES = {
+    each.__name__: each
+    for each in (agents, policies, quick, seeds, paper, dead_ends, noise, external)
+}
 
 
 def spread(entry: Entry, metric: str = "success") -> float:
