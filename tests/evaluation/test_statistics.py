@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tracemalloc
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sqn_jax.evaluation import statistics
 from sqn_jax.evaluation.statistics import (
     bootstrap_interval,
     interquartile_mean,
@@ -124,3 +126,59 @@ def test_spl_by_hand() -> None:
         [True, True, False, True, True], [10.0, 4.0, 5.0, 20.0, 0.0], [5.0, 5.0, 5.0, 20.0, 0.0]
     )
     np.testing.assert_allclose(spl, [0.5, 1.0, 0.0, 1.0, 1.0])
+
+
+def test_the_worst_tenth_is_the_mean_of_the_lowest_scores() -> None:
+    scores = np.array([0.9, 0.2, 1.0, 0.4, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1] * 2)
+    assert statistics.worst_mean(scores, 0.1) == pytest.approx(0.1)  # The two of 0.1.
+    assert statistics.worst_mean(scores, 0.2) == pytest.approx(0.15)
+    assert statistics.worst_mean([0.5, 0.25, 1.0], 0.1) == 0.25  # One at least.
+
+
+def test_an_interval_over_tasks_is_that_of_their_mean() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.normal(size=(1, 400))
+    low, high = statistics.clustered_interval(scores)
+    half = 1.96 * scores.std(ddof=1) / np.sqrt(400)
+    assert (low, high) == pytest.approx((scores.mean() - half, scores.mean() + half), abs=0.02)
+
+
+def test_an_interval_covers_the_spread_of_tasks_and_of_training_seeds() -> None:
+    """By a plain loop that draws seeds and tasks one by one."""
+    rng = np.random.default_rng(1)
+    scores = rng.normal(size=(5, 1)) + 0.3 * rng.normal(size=(5, 30))
+    means = [
+        np.mean([[scores[s, t] for t in tasks] for s in rng.integers(5, size=5)])
+        for tasks in rng.integers(30, size=(4000, 30))
+    ]
+    expected = np.quantile(means, [0.025, 0.975])
+    assert statistics.clustered_interval(scores, resamples=8000) == pytest.approx(
+        expected, abs=0.06
+    )
+    low, high = statistics.clustered_interval(scores.mean(axis=0, keepdims=True))
+    assert high - low < 0.4 * (expected[1] - expected[0])  # Without the seeds' own spread.
+
+
+def test_an_interval_of_nothing_but_successes_is_wilson_s_over_tasks() -> None:
+    expected = statistics.wilson_interval(12, 12)
+    assert statistics.clustered_interval(np.ones((3, 12)), is_rate=True) == pytest.approx(expected)
+    assert statistics.clustered_interval(np.zeros((1, 12)), is_rate=True)[0] == pytest.approx(0)
+
+
+def test_two_agents_are_compared_task_by_task() -> None:
+    """The p-value by all ways to exchange the two in eight tasks."""
+    rng = np.random.default_rng(2)
+    first, second = rng.uniform(size=8) + 0.2, rng.uniform(size=8)
+    found = statistics.paired_comparison(first, second)
+    differences = first - second
+    signs = np.array(list(itertools.product((1, -1), repeat=8)))
+    all_means = (signs * differences).mean(axis=1)
+    observed = differences.mean()
+    p_value = 2 * min(
+        (all_means >= observed - 1e-12).mean(), (all_means <= observed + 1e-12).mean()
+    )
+    assert found["difference"] == pytest.approx(observed)
+    assert found["p_value"] == pytest.approx(min(1.0, p_value))
+    low, high = found["ci95"]
+    assert low < observed < high
+    assert statistics.paired_comparison([0.5], [0.2])["p_value"] is None
