@@ -20,7 +20,7 @@ from experiments.common import run
 from sqn_jax.config import EnvConfig
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, TrainedAgent
 from sqn_jax.evaluation.scores import markdown_table
-from sqn_jax.evaluation.suites import SuiteSettings
+from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.policies.pretrained import find_policy, pretrained_names
 from sqn_jax.runs.evaluate import evaluate_suite_session
 from sqn_jax.storage.files import write_json

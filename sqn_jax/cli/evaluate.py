@@ -110,8 +110,8 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
 
 
 def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
+    from sqn_jax.evaluation.settings import SuiteSettings
     from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table
-    from sqn_jax.evaluation.suites import SuiteSettings
     from sqn_jax.runs.evaluate import evaluate_suite_session
     from sqn_jax.tasks import read_suite
 

@@ -76,6 +76,38 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class SuiteSettings:
+    """How often each task is tried."""
+
+    episodes: int = 1
+    """Episodes per task and evaluation seed."""
+    eval_seeds: int = 5
+    """Number of evaluation seeds."""
+    seed: int = 1_000
+    """The first evaluation seed."""
+    noise: tuple[float, float] = (0.0, 0.0)
+    """Velocity noise and range noise, in the units of each robot."""
+
+    def __post_init__(self) -> None:
+        require_limits(self.episodes, "episodes", *LIMITS["eval.episodes"])
+        require_limits(self.eval_seeds, "eval_seeds", *LIMITS["eval.seeds"])
+        least, most = LIMITS["eval.seed"]
+        require_limits(self.seed, "seed", least, most + 1 - self.eval_seeds)
+        require_limits(self.noise[0], "velocity noise", *LIMITS["env.velocity_noise"])
+        require_limits(self.noise[1], "range noise", *LIMITS["env.range_noise"])
+
+    @property
+    def all_eval_seeds(self) -> list[int]:
+        """The evaluation seeds, which are consecutive."""
+        return [self.seed + index for index in range(self.eval_seeds)]
+
+    @property
+    def tries(self) -> int:
+        """Episodes of each task, of one policy."""
+        return self.episodes * self.eval_seeds
+
+
+@dataclass(frozen=True)
 class World:
     """A map prepared for a robot, with one kind of tasks and one level of noise."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from sqn_jax.evaluation import statistics
 from sqn_jax.evaluation.agents import Agent
 from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.scores import markdown_table
+from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.tasks.suite import TaskSuite
 
 METRICS = (
@@ -29,19 +30,6 @@ METRICS = (
     "coverage_m2",
 )
 WORST_FRACTION = 0.1
-
-
-class Tries(Protocol):
-    """How often each task is tried."""
-
-    @property
-    def episodes(self) -> int: ...
-    @property
-    def all_eval_seeds(self) -> list[int]: ...
-    @property
-    def tries(self) -> int: ...
-    @property
-    def noise(self) -> tuple[float, float]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +75,7 @@ class SuiteTable:
             for name, numbers_of_tries in entered.items():
                 self.values[name][seed, numbers] = np.asarray(numbers_of_tries).reshape(shape)
 
-    def records(self, suite: TaskSuite, settings: Tries) -> Iterator[dict[str, Any]]:
+    def records(self, suite: TaskSuite, settings: SuiteSettings) -> Iterator[dict[str, Any]]:
         """One flat object per episode, ready for JSON lines."""
         for seed, training_seed in enumerate(self.agent.training_seeds):
             for number, task in enumerate(suite.tasks):
@@ -115,14 +103,16 @@ class SuiteTable:
                     }
 
 
-def empty_table(agent: Agent, suite: TaskSuite, settings: Tries) -> SuiteTable:
+def empty_table(agent: Agent, suite: TaskSuite, settings: SuiteSettings) -> SuiteTable:
     """A table to be filled."""
     shape = (len(agent.training_seeds), len(suite.tasks), settings.tries)
     values = {name: np.full(shape, np.nan) for name in METRICS}
     return SuiteTable(agent, values, np.full(len(suite.tasks), np.nan))
 
 
-def contents(tables: Sequence[SuiteTable], suite: TaskSuite, settings: Tries) -> dict[str, Any]:
+def contents(
+    tables: Sequence[SuiteTable], suite: TaskSuite, settings: SuiteSettings
+) -> dict[str, Any]:
     """The contents of the evaluation file, ready for JSON.
 
     Returns:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.config import EnvConfig
-from sqn_jax.config.validation import LIMITS, require_limits
 from sqn_jax.env import EnvParams, EnvState, Observation, make_env
 from sqn_jax.env.navigation import STAND
 from sqn_jax.env.prepare import with_noise
@@ -26,6 +25,7 @@ from sqn_jax.env.several_maps import join_maps
 from sqn_jax.evaluation import baseline_episodes, episodes, suite_scores
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, OnBatch, TrainedAgent
 from sqn_jax.evaluation.episodes import EpisodeResults, GivenTasks
+from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.tasks.suite import Task, TaskSuite
 from sqn_jax.training import memory_budget
@@ -39,38 +39,6 @@ CELLS_AT_ONCE = 2**22
 EPISODE_STREAM = 2
 """Which of the streams of an evaluation seed the episodes of a suite follow; drawn tasks have 0
 and 1."""
-
-
-@dataclass(frozen=True)
-class SuiteSettings:
-    """How often each task is tried."""
-
-    episodes: int = 1
-    """Episodes per task and evaluation seed."""
-    eval_seeds: int = 5
-    """Number of evaluation seeds."""
-    seed: int = 1_000
-    """The first evaluation seed."""
-    noise: tuple[float, float] = (0.0, 0.0)
-    """Velocity noise and range noise, in the units of each robot."""
-
-    def __post_init__(self) -> None:
-        require_limits(self.episodes, "episodes", *LIMITS["eval.episodes"])
-        require_limits(self.eval_seeds, "eval_seeds", *LIMITS["eval.seeds"])
-        least, most = LIMITS["eval.seed"]
-        require_limits(self.seed, "seed", least, most + 1 - self.eval_seeds)
-        require_limits(self.noise[0], "velocity noise", *LIMITS["env.velocity_noise"])
-        require_limits(self.noise[1], "range noise", *LIMITS["env.range_noise"])
-
-    @property
-    def all_eval_seeds(self) -> list[int]:
-        """The evaluation seeds, which are consecutive."""
-        return [self.seed + index for index in range(self.eval_seeds)]
-
-    @property
-    def tries(self) -> int:
-        """Episodes of each task, of one policy."""
-        return self.episodes * self.eval_seeds
 
 
 @dataclass(frozen=True, eq=False)

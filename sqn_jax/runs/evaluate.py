@@ -17,8 +17,8 @@ from sqn_jax.evaluation.compare import (
     memory_bytes,
     num_episodes,
 )
-from sqn_jax.evaluation.settings import Settings
-from sqn_jax.evaluation.suites import SuiteMaps, SuiteSettings, evaluate_suite, robot_for
+from sqn_jax.evaluation.settings import Settings, SuiteSettings
+from sqn_jax.evaluation.suites import SuiteMaps, evaluate_suite, robot_for
 from sqn_jax.evaluation.suites import num_episodes as num_suite_episodes
 from sqn_jax.maps import load_map
 from sqn_jax.runs.progress import episodes_bar

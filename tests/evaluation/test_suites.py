@@ -22,6 +22,7 @@ from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
 from sqn_jax.evaluation import episodes, suite_scores, suites
 from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
+from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.tasks import Task, TaskSuite
@@ -62,7 +63,7 @@ TASKS = (
     task("wide", (4.23, 2.23), (0.75, 0.75)),
 )
 SUITE = TaskSuite("rooms", TASKS)
-SETTINGS = suites.SuiteSettings(episodes=2, eval_seeds=2)
+SETTINGS = SuiteSettings(episodes=2, eval_seeds=2)
 
 
 def agent(num_seeds: int = 1) -> TrainedAgent:
