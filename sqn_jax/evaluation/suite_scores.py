@@ -210,14 +210,13 @@ def suite_table(evaluation: dict[str, Any]) -> str:
 
 
 def comparison_lines(evaluation: dict[str, Any]) -> Iterator[str]:
-    """For each two agents a line on which has more success on the same tasks."""
+    """For each agent a line on how its success compares to the wall follower's."""
     for comparison in evaluation["comparisons"]:
         success = comparison["success"]
-        if success["p_value"] is None:
+        if comparison["second"] != "bug" or success["p_value"] is None:
             continue
         low, high = success["ci95"]
         yield (
-            f"{comparison['first']} less {comparison['second']}: success "
-            f"{success['difference']:+.2f}, 95 % interval {low:+.2f} to {high:+.2f}, "
-            f"p = {success['p_value']:.3g}"
+            f"{comparison['first']} against bug: {success['difference']:+.2f} success, "
+            f"95 % interval {low:+.2f} to {high:+.2f}, p = {success['p_value']:.2g}"
         )

@@ -238,6 +238,14 @@ def test_the_oracle_arrives_on_every_map(evaluated: Any) -> None:
     assert [entry["map"] for entry in of_agents["bug"]["maps"]] == ["wide", "turned", "coarse"]
 
 
+def test_each_policy_is_compared_to_the_wall_follower_in_a_line(evaluated: Any) -> None:
+    lines = list(suite_scores.comparison_lines(evaluated[0]))
+    assert [line.split(" against ")[0] for line in lines] == ["sqn", "random"]
+    means = {entry["agent"]: entry["success"]["mean"] for entry in evaluated[0]["results"]}
+    for name, line in zip(("sqn", "random"), lines, strict=True):
+        assert f"against bug: {means[name] - means['bug']:+.2f} success, " in line
+
+
 def test_the_numbers_are_means_of_the_records(evaluated: Any) -> None:
     contents, records = evaluated
     assert len(records) == 4 * len(TASKS) * SETTINGS.tries
