@@ -23,7 +23,9 @@ Params = Any
 
 GOAL_SCALE = 4.0
 """Initial scale of the layer that sees the goal. Where to turn is decided within a twentieth of the
-heading's range and a hundredth of the distance's; at scale 1 no ReLU bends that sharply."""
+heading's range and a hundredth of the distance's; at scale 1 no ReLU bends that sharply. The goal's
+radius of 0.3 m is 1/80 of the range of a distance up to 24 m, and 1/18 of that of one encoded as
+d / (d + 5 m): as fine as the heading, so the same scale serves."""
 
 HEAD_SCALE = 0.1
 """Initial scale of Q-heads and of the skill decision: small values, no skill preferred."""

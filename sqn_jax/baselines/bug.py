@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env.geometry import beam_angles, wrap_angle
+from sqn_jax.env.geometry import beam_angles, decode_distance, farthest_shown, wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 
 FINENESS = 3
@@ -84,7 +84,7 @@ class BugNavigator:
         """Actions [E] from the observed ranges [E, R] and goals [E, 2 or 3], all in 0..1."""
         readings = ranges * self.config.max_range
         clear = self.clear_lengths(readings)
-        distance = goal[:, 0] * self.config.max_goal_distance
+        distance = decode_distance(goal[:, 0], self.config)
         if self.config.heading_encoding == "linear":
             heading = goal[:, 1] * 2 * np.pi - np.pi
         else:
@@ -166,7 +166,7 @@ class _Robot:
     def _locate_goal(self, distance: float, heading: float) -> None:
         """Note where the goal is; beyond the largest distance that is shown, by its bearings."""
         ray = cmath.rect(1.0, self.heading + heading)
-        shown = self.bug.config.max_goal_distance
+        shown = farthest_shown(self.bug.config)
         if distance >= shown * (1 - 1e-6):
             guess = self.place + 1.2 * shown * ray if self.goal is None else self.goal
             distance = max(shown, ((guess - self.place) * ray.conjugate()).real)

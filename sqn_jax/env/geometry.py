@@ -40,3 +40,26 @@ def goal_in_robot_frame(pose: Array, goal: Array) -> tuple[Array, Array]:
     delta_x, delta_y = goal[0] - pose[0], goal[1] - pose[1]
     distance = jnp.hypot(delta_x, delta_y)
     return distance, wrap_angle(jnp.arctan2(delta_y, delta_x) - pose[2])
+
+
+def encode_distance(distance: Array, config: EnvConfig) -> Array:
+    """Goal distance in m, of any shape, as the agent sees it, in 0..1.
+
+    "clipped" is d / `max_goal_distance`, and 1 from there on. "rational" is d / (d + c) with c the
+    `goal_distance_scale`: steepest at the goal, and never at an end.
+    """
+    if config.goal_distance_encoding == "clipped":
+        return jnp.clip(distance / config.max_goal_distance, 0.0, 1.0)
+    return distance / (distance + config.goal_distance_scale)
+
+
+def decode_distance(encoded: NDArray[Any], config: EnvConfig) -> NDArray[Any]:
+    """The inverse of `encode_distance`, m; "clipped" shows no more than `max_goal_distance`."""
+    if config.goal_distance_encoding == "clipped":
+        return encoded * config.max_goal_distance
+    return config.goal_distance_scale * encoded / np.maximum(1 - encoded, 2.0**-24)
+
+
+def farthest_shown(config: EnvConfig) -> float:
+    """Goal distance from which on observations are all the same, m."""
+    return config.max_goal_distance if config.goal_distance_encoding == "clipped" else math.inf

@@ -349,6 +349,27 @@ def test_bug_reads_both_encodings_of_the_goal() -> None:
     assert len(np.unique(chosen[0])) > 2
 
 
+def test_bug_reads_a_rational_goal_distance() -> None:
+    """At d / (d + 5 m) it does what it does at d / 24 m, and knows how far off 60 m are."""
+    rng = np.random.default_rng(1)
+    ranges = rng.uniform(0.1, 1.0, (50, 71))
+    distance, heading = rng.uniform(1.0, 22.0, 50), rng.uniform(0, 1, 50)
+    chosen = [
+        BugNavigator(EnvConfig(goal_distance_encoding=encoding), 50).choose(
+            ranges, np.stack([encoded, heading], axis=-1)
+        )
+        for encoding, encoded in (
+            ("clipped", distance / 24),
+            ("rational", distance / (distance + 5)),
+        )
+    ]
+    np.testing.assert_array_equal(*chosen)
+    far = BugNavigator(EnvConfig(goal_distance_encoding="rational"), 1)
+    far.choose(ranges[:1], np.array([[60 / 65, 0.5]]))
+    assert far.robots[0].goal is not None
+    assert abs(far.robots[0].goal) == pytest.approx(60.0, abs=1e-6)
+
+
 def test_bug_leaves_no_gap_between_beams_unseen() -> None:
     config = EnvConfig()
     bug = BugNavigator(config, 1)

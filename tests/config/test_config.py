@@ -28,6 +28,7 @@ AT_LEAST_ONE = {
 POSITIVE = {
     *("env.max_range", "env.time_step", "env.goal_radius", "env.max_goal_distance"),
     *("env.coverage_cell", "env.field_of_view_deg", "learner.learning_rate"),
+    "env.goal_distance_scale",
     *("learner.adam_epsilon", "learner.max_grad_norm", "learner.target_update_rate"),
     *("exploration.decay_fraction", "checkpoint_minutes"),
 }
@@ -143,6 +144,7 @@ def test_a_whole_number_passes_for_a_float(name: str) -> None:
         ("env.ray_sectors", 2),
         ("env.ray_sectors", 34),
         ("env.heading_encoding", "degrees"),
+        ("env.goal_distance_encoding", "logarithmic"),
         ("env.velocity_noise_unit", "percent"),
         ("learner.learning_rate_schedule", "cosine"),
         ("algo", "ppo"),
@@ -242,6 +244,7 @@ def changed_everywhere() -> TrainConfig:
             ray_sectors=24,
             ray_iterations=3,
             heading_encoding="sincos",
+            goal_distance_encoding="rational",
             velocity_noise_unit="absolute",
             range_noise_unit="absolute",
         ),

@@ -62,6 +62,7 @@ def test_it_learns_on_from_there(runs: TinyRuns) -> None:
         ),
         (["--env.num-beams", "31"], "its env.num_beams is 71, here it is 31"),
         (["--env.heading-encoding", "sincos"], "its env.heading_encoding is linear, here"),
+        (["--env.goal-distance-encoding", "rational"], "its env.goal_distance_encoding is clipped"),
     ],
 )
 def test_another_network_is_refused_before_anything_is_written(
