@@ -137,6 +137,8 @@ class NetworkConfig:
     """Layer normalization before each ReLU; recurrent PQN needs it, the paper has none."""
     dqn_width_factor: int = 3
     """How much wider the DQN's layers after the features are (paper section IV-D)."""
+    motion_inputs: bool = False
+    """The agent is also told its last action, and whether that was a move that was refused."""
 
     def __post_init__(self) -> None:
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):

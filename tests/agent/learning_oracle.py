@@ -70,8 +70,16 @@ class Outputs:
     carry: FLOATS
 
 
-def forward(algo: str, params: Tree, ranges: FLOATS, goal: FLOATS, carry: FLOATS) -> Outputs:
-    """Run one of the three networks over ranges [T, B, R] and goal [T, B, G]."""
+def forward(
+    algo: str,
+    params: Tree,
+    ranges: FLOATS,
+    goal: FLOATS,
+    carry: FLOATS,
+    motion: FLOATS | None = None,
+) -> Outputs:
+    """Run one of the three networks over ranges [T, B, R], goal [T, B, G] and, for one that takes
+    it, motion [T, B, A + 1]."""
     tree = params["params"]
     length, batch = ranges.shape[:2]
     carry = np.array(carry, np.float64)
@@ -82,6 +90,7 @@ def forward(algo: str, params: Tree, ranges: FLOATS, goal: FLOATS, carry: FLOATS
                 [
                     mlp(tree["features"]["ranges"], ranges[t, b]),
                     mlp(tree["features"]["goal"], goal[t, b]),
+                    np.zeros(0) if motion is None else motion[t, b],
                 ]
             )
             if algo == "dqn":

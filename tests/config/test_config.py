@@ -249,7 +249,7 @@ def changed_everywhere() -> TrainConfig:
             range_noise_unit="absolute",
         ),
         randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3, True),
-        network=config_module.NetworkConfig(9, 3, True, 2),
+        network=config_module.NetworkConfig(9, 3, True, 2, True),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(
             10,
