@@ -16,6 +16,7 @@ from jax import Array
 
 from sqn_jax.agent.gru import GRU
 from sqn_jax.agent.linear import Dense
+from sqn_jax.agent.refined_gru import RefinedGRU
 from sqn_jax.config import Algorithm, NetworkConfig
 
 Params = Any
@@ -29,6 +30,9 @@ d / (d + 5 m): as fine as the heading, so the same scale serves."""
 
 HEAD_SCALE = 0.1
 """Initial scale of Q-heads and of the skill decision: small values, no skill preferred."""
+
+
+_CELLS: dict[str, Callable[..., GRU | RefinedGRU]] = {"gru": GRU, "refined_gru": RefinedGRU}
 
 
 class HasObservation(Protocol):
@@ -111,7 +115,8 @@ class SkillQNetwork(nn.Module):
         size, norm = self.config.hidden_size, self.config.layer_norm
         num_skills = self.config.num_skills
         features = Features(size, self.config.motion_inputs, name="features")(obs)  # eq. 1
-        carry, perception = GRU(size, name="perception")(features, carry)  # eq. 2
+        cell = _CELLS[self.config.cell](size, name="perception")
+        carry, perception = cell(features, carry)  # eq. 2
 
         decision = MLP(size, num_skills, norm, output_scale=HEAD_SCALE, name="decision")
         z_decision = decision(perception + self._embedding("decision"))  # eq. 3
@@ -144,7 +149,7 @@ class RecurrentQNetwork(nn.Module):
         """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
         size, norm = self.config.hidden_size, self.config.layer_norm
         features = Features(size, self.config.motion_inputs, name="features")(obs)
-        carry, perception = GRU(size, name="perception")(features, carry)
+        carry, perception = _CELLS[self.config.cell](size, name="perception")(features, carry)
         head = MLP(size, self.num_actions, norm, output_scale=HEAD_SCALE, name="skill_0")
         return carry, _single_head(head(perception))
 

@@ -139,8 +139,12 @@ class NetworkConfig:
     """How much wider the DQN's layers after the features are (paper section IV-D)."""
     motion_inputs: bool = False
     """The agent is also told its last action, and whether that was a move that was refused."""
+    cell: Literal["gru", "refined_gru"] = "gru"
+    """sqn, r2d2: the recurrent unit; the refined one scales its candidate by the input and learns
+    how its update gate saturates."""
 
     def __post_init__(self) -> None:
+        require_known_choices(self, "network")
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):
             value = getattr(self, name)
             require(value >= 1, f"network.{name}", value, "at least 1")

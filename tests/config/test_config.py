@@ -145,6 +145,7 @@ def test_a_whole_number_passes_for_a_float(name: str) -> None:
         ("env.ray_sectors", 34),
         ("env.heading_encoding", "degrees"),
         ("env.goal_distance_encoding", "logarithmic"),
+        ("network.cell", "lstm"),
         ("env.velocity_noise_unit", "percent"),
         ("learner.learning_rate_schedule", "cosine"),
         ("algo", "ppo"),
@@ -249,7 +250,7 @@ def changed_everywhere() -> TrainConfig:
             range_noise_unit="absolute",
         ),
         randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3, True),
-        network=config_module.NetworkConfig(9, 3, True, 2, True),
+        network=config_module.NetworkConfig(9, 3, True, 2, True, "refined_gru"),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(
             10,
