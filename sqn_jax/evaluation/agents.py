@@ -242,6 +242,7 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
             checkpoint_minutes=1.0,
             checkpoint_replay=True,
             max_skipped_updates=0,
+            eval=dataclasses.replace(policy.config.eval, curve_points=0, curve_episodes=1),
         )
         pools.setdefault(without_seed, []).append(policy)
     algorithms = [config.algo for config in pools]
