@@ -80,7 +80,7 @@ def _agents(options: argparse.Namespace) -> list[Agent]:
 
 
 def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
-    from sqn_jax.evaluation.scores import results_table
+    from sqn_jax.evaluation.scores import results_table, table_note
     from sqn_jax.evaluation.settings import Settings
     from sqn_jax.runs.evaluate import evaluate_session
 
@@ -99,7 +99,9 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
         robot_radius=options.robot_radius,
     )
     evaluation = evaluate_session(_agents(options), settings, options.out)
-    say_lines(results_table(evaluation["results"]).split("\n"))
+    say_lines(
+        [*results_table(evaluation["results"]).split("\n"), table_note(evaluation["results"])]
+    )
     for comparison in evaluation["comparisons"]:
         low, high = comparison["ci95"]
         say(
@@ -111,7 +113,7 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
 
 def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
     from sqn_jax.evaluation.settings import SuiteSettings
-    from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table
+    from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table, table_notes
     from sqn_jax.runs.evaluate import evaluate_suite_session
     from sqn_jax.tasks import read_suite
 
@@ -129,7 +131,8 @@ def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
         noise=(sum(options.velocity_noise), sum(options.range_noise)),
     )
     evaluation, _ = evaluate_suite_session(_agents(options), suite, settings, options.out, file)
-    say_lines([*suite_table(evaluation).split("\n"), *comparison_lines(evaluation)])
+    table, notes = suite_table(evaluation).split("\n"), table_notes(evaluation)
+    say_lines([*table, *notes, *comparison_lines(evaluation)])
 
 
 def _parser() -> Parser:
