@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
-from sqn_jax.evaluation import episodes, suite_scores, suites
+from sqn_jax.evaluation import episodes, suite_recording, suite_scores, suites
 from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
 from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
@@ -291,6 +292,37 @@ def test_failures_take_the_limit_of_their_task(evaluated: Any) -> None:
         assert record["time_steps"] <= TASKS[record["task"]].max_steps
         if not record["success"]:
             assert record["time_steps"] == TASKS[record["task"]].max_steps
+
+
+def test_a_recorded_task_is_the_first_try_of_the_evaluation_to_its_own_limit(
+    evaluated: Any,
+) -> None:
+    """Whatever the order asked for, and without the others of their maps."""
+    load = ROOMS.__getitem__
+    settings = suite_recording.first_try(SETTINGS.seed)
+    numbers = [2, 0]
+    recorded = suite_recording.record_tasks(agent(), SUITE, numbers, load, settings)
+    firsts = [r for r in evaluated[1] if r["agent"] == "sqn" and r["eval_seed"] == SETTINGS.seed]
+    for number, one in zip(numbers, recorded, strict=True):
+        (record,) = (r for r in firsts if r["task"] == number and r["episode"] == 0)
+        assert one.occupancy_map is ROOMS[TASKS[number].map_file]
+        assert one.num_steps == TASKS[number].max_steps == len(one.trajectory.covered) - 1
+        assert one.success == record["success"]
+        assert one.time_steps == record["time_steps"]
+        assert one.rewards.mean() == pytest.approx(record["mean_reward"], rel=1e-5)
+        assert one.goal_radius == pytest.approx(TASKS[number].goal_radius)
+
+
+@pytest.mark.parametrize(
+    ("collisions", "collision_ends", "expected"),
+    [([3, 5], True, 4), ([3, 5], False, 10), ([12], True, 10), ([], True, 10)],
+)
+def test_a_recorded_task_ends_where_its_episode_does(
+    collisions: list[int], collision_ends: bool, expected: int
+) -> None:
+    refused = np.isin(np.arange(LENGTH), collisions)
+    one: Any = SimpleNamespace(collisions=refused)
+    assert suite_recording._length(one, TASKS[2], collision_ends) == expected
 
 
 @pytest.mark.parametrize(
