@@ -220,13 +220,13 @@ def worst_mean(scores: ArrayLike, fraction: float) -> float:
     Scores that are means of few episodes are noisy, and the lowest are lower than they would be in
     the long run. Two maps with success 0.5 and one try each: the tries end 0 0, 0 1, 1 0 or 1 1,
     equally often, and the lower one is 0, 0, 0 or 1: on average 0.25 instead of 0.5.
-    `held_out_worst_mean` has no such bias.
+    `split_worst_mean` has no such bias.
     """
     ordered = np.sort(np.asarray(scores, np.float64))
     return float(ordered[: _worst_count(fraction, len(ordered))].mean())
 
 
-def held_out_worst_mean(first: ArrayLike, second: ArrayLike, fraction: float) -> float:
+def split_worst_mean(first: ArrayLike, second: ArrayLike, fraction: float) -> float:
     """Mean score of the maps that other tries have shown to be the worst.
 
     Maps are ranked by one half of their tries and judged by the other, both ways round, so that bad

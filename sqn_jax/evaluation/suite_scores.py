@@ -120,7 +120,7 @@ def contents(
         training seeds and `std_of_tasks`, the sample standard deviation (n - 1) of the means of the
         tasks; `worst_tenth`, the mean success on the tenth of the maps that have the least (at
         least one map), which reads too low with few tries, see `statistics.worst_mean`;
-        `worst_tenth_held_out`, where maps are ranked by every other try and judged by the rest,
+        `worst_tenth_split`, where maps are ranked by every other try and judged by the rest,
         None with one try of each task; `maps` and `tasks`, the success and SPL on each.
         `comparisons`: for each two agents the difference of success and of SPL on the same tasks,
         see `statistics.paired_comparison`.
@@ -176,7 +176,7 @@ def _describe(table: SuiteTable, maps: Sequence[str]) -> dict[str, Any]:
     }
     on_maps = np.array([of_tasks["success"][chosen].mean() for chosen in of_maps.values()])
     described["worst_tenth"] = statistics.worst_mean(on_maps, WORST_FRACTION)
-    described["worst_tenth_held_out"] = _held_out(table.values["success"], list(of_maps.values()))
+    described["worst_tenth_split"] = _split_worst(table.values["success"], list(of_maps.values()))
     described["maps"] = [
         {
             "map": map_file,
@@ -192,13 +192,15 @@ def _describe(table: SuiteTable, maps: Sequence[str]) -> dict[str, Any]:
     return described
 
 
-def _held_out(success: NDArray[np.float64], of_maps: Sequence[NDArray[np.bool_]]) -> float | None:
-    """`statistics.held_out_worst_mean` of success [S, M, tries]; None with one try."""
+def _split_worst(
+    success: NDArray[np.float64], of_maps: Sequence[NDArray[np.bool_]]
+) -> float | None:
+    """`statistics.split_worst_mean` of success [S, M, tries]; None with one try."""
     if success.shape[2] < 2:
         return None
     halves = [success[..., first::2].mean(axis=(0, 2)) for first in range(2)]
     first, second = ([half[chosen].mean() for chosen in of_maps] for half in halves)
-    return statistics.held_out_worst_mean(first, second, WORST_FRACTION)
+    return statistics.split_worst_mean(first, second, WORST_FRACTION)
 
 
 def suite_table(evaluation: dict[str, Any]) -> str:
@@ -207,8 +209,8 @@ def suite_table(evaluation: dict[str, Any]) -> str:
     rows = []
     for entry in evaluation["results"]:
         low, high = entry["success"]["ci95"]
-        held_out = entry["worst_tenth_held_out"]
-        worst = entry["worst_tenth"] if held_out is None else held_out
+        of_split = entry["worst_tenth_split"]
+        worst = entry["worst_tenth"] if of_split is None else of_split
         rows.append(
             [
                 entry["agent"],
@@ -230,7 +232,7 @@ def table_notes(evaluation: dict[str, Any]) -> Iterator[str]:
     if any(len(entry["training_seeds"]) > 1 for entry in results):
         over = "over training seeds and tasks, of an agent with one training seed over tasks only"
     yield f"95 % interval: {over}"
-    if any(entry["worst_tenth_held_out"] is None for entry in results):
+    if any(entry["worst_tenth_split"] is None for entry in results):
         yield (
             "worst tenth: the maps with the least success; with one try of each task bad luck is "
             "among them, so it reads too low"

@@ -141,12 +141,12 @@ def test_bad_luck_is_among_the_worst_unless_other_tries_judge() -> None:
     assert np.mean([statistics.worst_mean(tries, 0.5) for tries in one_try]) == 0.25
     assert np.mean(
         [
-            statistics.held_out_worst_mean(first, second, 0.5)
+            statistics.split_worst_mean(first, second, 0.5)
             for first, second in itertools.product(one_try, repeat=2)
         ]
     ) == pytest.approx(0.5)
     # Ranked by the first half it is the second map, by the other the third.
-    assert statistics.held_out_worst_mean([0.9, 0.1, 0.5], [0.8, 0.6, 0.2], 0.1) == (0.6 + 0.5) / 2
+    assert statistics.split_worst_mean([0.9, 0.1, 0.5], [0.8, 0.6, 0.2], 0.1) == (0.6 + 0.5) / 2
 
 
 def test_an_interval_over_tasks_is_that_of_their_mean() -> None:

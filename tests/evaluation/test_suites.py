@@ -238,14 +238,14 @@ def test_the_table_of_a_suite_says_what_its_interval_and_its_worst_tenth_are(
     assert interval == "95 % interval: over tasks only, one training seed"
     assert "every other try, judged by the rest" in worst
     once = evaluated[0] | {
-        "results": [entry | {"worst_tenth_held_out": None} for entry in evaluated[0]["results"]]
+        "results": [entry | {"worst_tenth_split": None} for entry in evaluated[0]["results"]]
     }
     assert "reads too low" in list(suite_scores.table_notes(once))[1]
     # Two maps of two tasks, four tries. Even tries: 0.25, 0.75; odd ones: 1 and 0.5.
     success = np.array([[[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 1, 0], [1, 1, 0, 1]]], float)
     of_maps = [np.array([True, True, False, False]), np.array([False, False, True, True])]
-    assert suite_scores._held_out(success, of_maps) == (1.0 + 0.75) / 2
-    assert suite_scores._held_out(success[..., :1], of_maps) is None
+    assert suite_scores._split_worst(success, of_maps) == (1.0 + 0.75) / 2
+    assert suite_scores._split_worst(success[..., :1], of_maps) is None
 
 
 def test_the_oracle_arrives_on_every_map(evaluated: Any) -> None:
