@@ -241,6 +241,9 @@ def test_the_table_of_a_suite_says_what_its_interval_and_its_worst_tenth_are(
         "results": [entry | {"worst_tenth_split": None} for entry in evaluated[0]["results"]]
     }
     assert "reads too low" in list(suite_scores.table_notes(once))[1]
+    entry = {"worst_tenth": 0.25, "worst_tenth_split": 0.5}
+    assert suite_scores.worst_tenth(entry) == 0.5
+    assert suite_scores.worst_tenth(entry | {"worst_tenth_split": None}) == 0.25
     # Two maps of two tasks, four tries. Even tries: 0.25, 0.75; odd ones: 1 and 0.5.
     success = np.array([[[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 1, 0], [1, 1, 0, 1]]], float)
     of_maps = [np.array([True, True, False, False]), np.array([False, False, True, True])]
