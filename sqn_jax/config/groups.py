@@ -254,12 +254,16 @@ class ExplorationConfig:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """The evaluation that follows a training run."""
+    """The evaluations of a training run: at its end, and at points of its learning curve."""
 
     episodes: int = 100
     """Greedy episodes from the evaluation points, and as many from random spawn pairs."""
     seed: int = 1_000
     """Seed of the starts and goals; independent of the training seed."""
+    curve_points: int = 20
+    """How often, evenly over the run, the policy is evaluated while it is trained; 0: never."""
+    curve_episodes: int = 100
+    """Greedy episodes from the evaluation points at each such time, the same at all."""
 
     def __post_init__(self) -> None:
         require_within_limits(self, "eval")

@@ -209,6 +209,18 @@ class EpisodeBatch:
         """The metrics for the first goal radius."""
         return next(iter(self.metrics.values()))
 
+    @property
+    def routes(self) -> NDArray[np.int64]:
+        """[E] numbers that are equal for tasks from and to the same two points of the map."""
+        occupancy_map = self.world.occupancy_map
+        is_evaluation = self.world.tasks == "evaluation points"
+        points = occupancy_map.evaluation_points if is_evaluation else occupancy_map.spawn_points
+        nearest = [
+            np.linalg.norm(places[:, None, :2] - points, axis=-1).argmin(axis=1)
+            for places in (self.starts, self.goals)
+        ]
+        return np.asarray(nearest[0] * len(points) + nearest[1], np.int64)
+
     def numbers(self, goal_radius: float) -> dict[str, NDArray[np.float64]]:
         """The numbers of each episode, [E] each, by the names that they have in the files."""
         metrics = self.metrics[goal_radius]
@@ -242,6 +254,7 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
             checkpoint_minutes=1.0,
             checkpoint_replay=True,
             max_skipped_updates=0,
+            eval=dataclasses.replace(policy.config.eval, curve_points=0, curve_episodes=1),
         )
         pools.setdefault(without_seed, []).append(policy)
     algorithms = [config.algo for config in pools]

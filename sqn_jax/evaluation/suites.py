@@ -7,7 +7,7 @@ program for all maps, and returns the contents of the evaluation file. It prints
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,9 +131,13 @@ def robot_for(env_config: EnvConfig, suite: TaskSuite) -> EnvConfig:
 
 
 def chunks(
-    suite: TaskSuite, robot: EnvConfig, load: LoadMap, noise: tuple[float, float] = (0.0, 0.0)
+    suite: TaskSuite,
+    robot: EnvConfig,
+    load: LoadMap,
+    noise: tuple[float, float] = (0.0, 0.0),
+    only: Collection[int] | None = None,
 ) -> Iterator[SuiteChunk]:
-    """Prepare the tasks of a suite for a robot, the maps of a chunk at a time.
+    """Prepare the tasks of a suite, or `only` some, for a robot, the maps of a chunk at a time.
 
     All chunks have the same number of steps, and count the covered area on the same lattice, so
     that they share their compiled program.
@@ -142,7 +146,13 @@ def chunks(
     for number, task in enumerate(suite.tasks):
         tasks_of.setdefault(task.map_file, []).append(number)
     sizes = {name: load(name) for name in tasks_of}
-    cells = {name: occupancy_map.occupied.size for name, occupancy_map in sizes.items()}
+    if only is not None:  # The episodes are those of the whole suite: sizes and limits as there.
+        tasks_of = {
+            name: chosen
+            for name, numbers in tasks_of.items()
+            if (chosen := [number for number in numbers if number in only])
+        }
+    cells = {name: sizes[name].occupied.size for name in tasks_of}
     of_maps = [occupancy_map.size_m for occupancy_map in sizes.values()]
     tile_m = (max(width for width, _ in of_maps), max(height for _, height in of_maps))
     max_steps = max(task.max_steps for task in suite.tasks)
@@ -234,9 +244,13 @@ def _shortest_paths(
 
 
 def run_chunk(
-    agent: Agent, chunk: SuiteChunk, settings: SuiteSettings, on_batch: OnBatch
+    agent: Agent,
+    chunk: SuiteChunk,
+    settings: SuiteSettings,
+    on_batch: OnBatch,
+    fields: Sequence[str] = (),
 ) -> list[EpisodeResults]:
-    """Run an agent on the tasks of a chunk.
+    """Run an agent on the tasks of a chunk; of policies alone `fields` of the trajectory, too.
 
     Returns:
         For each training seed the results of the tries of each task, task by task, [n * tries].
@@ -250,6 +264,7 @@ def run_chunk(
             chunk.joined,
             agent.network,
             epsilon=agent.epsilon,
+            fields=fields,
             on_batch=on_batch,
             tasks=tasks,
             collision_ends=chunk.collision_ends,
