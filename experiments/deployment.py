@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,7 +93,7 @@ def sensor_arrays(sensor: Sensor, env: EnvConfig) -> dict[str, np.ndarray]:
     }
 
 
-def measure(name: str, map_name: str, episodes: int, seeds: int) -> list[Mapping[str, Any]]:
+def measure(name: str, map_name: str, episodes: int, seeds: int) -> list[dict[str, Any]]:
     """Success with each sensor in each kind of tasks."""
     policy = load_policy(name)
     env = policy.config.env
@@ -104,7 +103,7 @@ def measure(name: str, map_name: str, episodes: int, seeds: int) -> list[Mapping
     ]
     stacked = jax.tree.map(lambda *x: np.stack(x), *params)
     network: Any = SensorNetwork(network_of(policy.config))
-    results = []
+    results: list[dict[str, Any]] = []
     for tasks, spawn in SPAWN_MODES.items():
         world = make_env(map_name, env, spawn=spawn)
         keys = [episode_keys(task_key(1_000 + seed, tasks), episodes) for seed in range(seeds)]
