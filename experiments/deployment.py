@@ -13,7 +13,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -78,8 +78,8 @@ class SensorNetwork:
         beyond = jnp.where(obs.ranges > sensor["limit"], sensor["beyond"], obs.ranges)
         ranges = jnp.where(expanded["seen"] > 0, beyond, sensor["unseen"])
         seen = dataclasses.replace(obs, ranges=ranges)
-        result: tuple[Array, QOutput] = self.network.apply(params["network"], seen, carry)
-        return result
+        result: Any = self.network.apply(params["network"], seen, carry)
+        return cast(tuple[Array, QOutput], result)
 
 
 def sensor_arrays(sensor: Sensor, env: EnvConfig) -> dict[str, np.ndarray]:
