@@ -1,7 +1,7 @@
 """Write the tables of the pages from the records: python experiments/readme_tables.py [--check]
 
-Each table stands between `<!-- table NAME -->` and `<!-- end -->` in README.md, docs/RESULTS.md or
-docs/LAB_NOTES.md; what is between is replaced. With `--check` nothing is written: the exit code is
+Each table stands between `<!-- table NAME -->` and `<!-- end -->` in README.md or a page of
+docs/; what is between is replaced. With `--check` nothing is written: the exit code is
 1 if a table is not what the records say.
 
 ± is the sample standard deviation (n - 1). Records without `std_ddof` hold the population figure,
@@ -24,7 +24,7 @@ from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.statistics import sample_std
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/RESULTS.md", "docs/LAB_NOTES.md")
+PAGES = ("README.md", "docs/RESULTS.md", "docs/LAB_NOTES.md", "docs/DEPLOYMENT.md")
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
 """Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
@@ -127,9 +127,26 @@ def _with_worst(row: Entry) -> str:
     return f"{row['success']['mean']:.2f}, {row['worst_tenth']:.2f}"
 
 
+def sensors() -> str:
+    """`pretrained:best` with other sensors than it was trained with: success and refused moves."""
+    results = recorded("deployment.json")["results"]
+    tasks = list(dict.fromkeys(entry["tasks"] for entry in results))
+    names = list(dict.fromkeys(entry["sensor"] for entry in results))
+    found = {(entry["sensor"], entry["tasks"]): entry for entry in results}
+    rows = [
+        [name, *(_with_collisions(found[name, each]) for each in tasks if (name, each) in found)]
+        for name in names
+    ]
+    return markdown_table(["success, refused moves an episode", *tasks], rows)
+
+
+def _with_collisions(entry: Entry) -> str:
+    return f"{entry['success']:.2f}, {entry['collisions']:.1f}"
+
+
 TABLES = {
     each.__name__: each
-    for each in (agents, policies, quick, seeds, paper, dead_ends, noise, external)
+    for each in (agents, policies, quick, seeds, paper, dead_ends, noise, external, sensors)
 }
 
 

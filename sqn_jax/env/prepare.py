@@ -96,16 +96,7 @@ def make_env(
         spawn_groups=jnp.asarray(groups, jnp.int32),
         spawn_neighbors=jnp.asarray(_nearest(middles, groups), jnp.int32),
         near_goal_fraction=jnp.float32(config.near_goal_fraction),
-        commands=jnp.array(
-            [
-                [0.0, 0.0],
-                [config.forward_speed, 0.0],
-                [-config.backward_speed, 0.0],
-                [0.0, config.turn_rate],
-                [0.0, -config.turn_rate],
-            ],
-            jnp.float32,
-        ),
+        commands=jnp.asarray(commands_of(config)),
         time_step=jnp.float32(config.time_step),
         goal_radius=jnp.float32(config.goal_radius),
         velocity_noise=_velocity_noise(config),
@@ -119,6 +110,18 @@ def make_env(
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
         tile=None if occupancy_map.tiles == (1, 1) else (width_m, height_m),
     )
+
+
+def commands_of(config: EnvConfig) -> NDArray[np.float32]:
+    """[5, 2] forward speed m/s and turn rate rad/s of each action of `env.ACTION_NAMES`."""
+    commands = [
+        [0.0, 0.0],
+        [config.forward_speed, 0.0],
+        [-config.backward_speed, 0.0],
+        [0.0, config.turn_rate],
+        [0.0, -config.turn_rate],
+    ]
+    return np.array(commands, np.float32)
 
 
 def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
