@@ -233,8 +233,8 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def prepare(options: Any, settings: Any) -> None:
         raise Begun
 
-    def read_runs(names: list[str], checkpoint: int | str) -> list[Any]:
-        return [type("Run", (), {"policy": find_policy(name, checkpoint)}) for name in names]
+    def read_runs(names: list[str], *which: Any) -> list[Any]:
+        return [type("Run", (), {"policy": find_policy(name, *which)}) for name in names]
 
     def begin(*_: Any, **options: Any) -> None:
         raise Begun

@@ -101,7 +101,7 @@ def _draw_reward(axes: Axes, rows: Rows, paper_reward: float | None) -> None:
     if _draw_evaluation(axes, rows, "eval_mean_reward"):
         if paper_reward is not None:
             axes.axhline(paper_reward, color="0.45", ls=":", lw=1.5, label="the paper's")
-        axes.legend(fontsize=9, loc="lower right", frameon=False)
+        axes.legend(fontsize=9, loc="best", frameon=False)
 
 
 def _draw_evaluation(axes: Axes, rows: Rows, name: str) -> bool:
@@ -150,10 +150,11 @@ def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -
 
 def _finish_fractions(axes: Axes) -> None:
     """A scale from 0 to 1, with space above for the legend."""
-    entries = len(axes.get_legend_handles_labels()[0])
-    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(entries / 3))
+    labels = axes.get_legend_handles_labels()[1]
+    columns = 3 if sum(map(len, labels)) < 40 else 2  # As wide as a panel.
+    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(len(labels) / columns))
     axes.set_yticks(np.linspace(0, 1, 6))
-    axes.legend(fontsize=9, loc="upper center", ncols=3, columnspacing=1.2, frameon=False)
+    axes.legend(fontsize=9, loc="upper center", ncols=columns, columnspacing=1.2, frameon=False)
 
 
 def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:

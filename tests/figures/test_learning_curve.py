@@ -166,6 +166,8 @@ def test_points_in_evaluation_lie_over_the_training_beside_the_paper_s_reward():
         np.testing.assert_array_equal(curve(axes, "evaluation").get_ydata(), values)
     np.testing.assert_allclose(curve(reward, "the paper's").get_ydata(), 1.35)
     assert "evaluation" in success.get_title()
+    box, frame = success.get_legend().get_window_extent(), success.get_window_extent()
+    assert frame.x0 <= box.x0 < box.x1 <= frame.x1, "the legend is as wide as the panel at most"
     seeds = [
         seeds_row(1),
         seeds_row(2) | {"eval_mean_reward": [1.0] * 3, "eval_success": [0.5] * 3},
