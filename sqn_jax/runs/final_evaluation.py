@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import importlib
-from contextlib import suppress
 from typing import Any
 
 import jax
-import numpy as np
 
 import sqn_jax
 from sqn_jax.agent.learner import policy_params
@@ -16,14 +12,13 @@ from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.compare import evaluate_agents
-from sqn_jax.evaluation.episodes import BATCH
-from sqn_jax.evaluation.settings import Settings, robot_for, worlds
+from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.outside.messages import say
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices, memory_budget
-from sqn_jax.training.state import RunnerState, params_shapes
+from sqn_jax.training.state import RunnerState
 
 FIELDS = ("output",)
 """What the figures need of the steps, beside the poses."""
@@ -52,26 +47,6 @@ def require_memory(program: Program) -> None:
     copies = len(settings.tasks) + 2
     needed = 4.0 * numbers * program.max_steps * settings.episodes * copies
     memory_budget.require(needed, "the final evaluation", "final evaluation")
-
-
-def prepare(config: TrainConfig, occupancy_map: OccupancyMap) -> None:
-    """Compile what the final evaluation runs, and load what draws, for a thread beside training's.
-
-    A batch of episodes is run with parameters of zeros: `evaluate_run` finds the programs then.
-
-    Args:
-        config: the config of the run.
-        occupancy_map: the first map of the run.
-    """
-    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params_shapes(config))
-    agent = TrainedAgent(config.algo, (Policy("untrained", config, seeds_of(zeros, config)),))
-    episodes = min(config.eval.episodes, BATCH)
-    settings = dataclasses.replace(settings_of(config), episodes=episodes)
-    maps = {(settings.maps[0], config.env.robot_radius): occupancy_map}
-    for world in worlds(robot_for(config.env, settings), maps, settings):
-        agent.run(settings.all_eval_seeds, world, settings, (), lambda count: None)
-    with suppress(ImportError):  # `draw_figures` says that Matplotlib is not installed.
-        importlib.import_module("sqn_jax.figures")
 
 
 def evaluate_run(

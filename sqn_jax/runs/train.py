@@ -11,7 +11,6 @@ import signal
 import time
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,6 @@ from sqn_jax.training.loop import (
     ChunkReport,
     CompiledChunk,
     compile_chunk,
-    compile_start,
     make_program,
     rounds_done,
     run,
@@ -110,11 +108,9 @@ def train_session(
         _announce(program, run_dir, num_bytes, resume_command)
         done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        first_map = _first_map(config, occupancy_map)
-        training = _Training(
-            env_params, program, folder, checkpoints, start, resume_command, first_map
-        )
+        training = _Training(env_params, program, folder, checkpoints, start, resume_command)
         runner = training.run(runner, None if board is None else board.scalars)
+        first_map = _first_map(config, occupancy_map)
         phase(f"evaluating on {first_map.name}")
         results, batches = final_evaluation.evaluate_run(runner, first_map, config, folder)
         phase("drawing")
@@ -260,12 +256,10 @@ class _Training:
         checkpoints: Checkpoints,
         start: Policy | None,
         resume_command: str,
-        first_map: OccupancyMap,
     ) -> None:
         config, mesh = program.config, program.mesh
         self._env_params, self._program, self._config = env_params, program, config
         self._start, self._resume_command = start, resume_command
-        self._first_map = first_map
         self._folder, self._checkpoints = folder, checkpoints
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
@@ -316,11 +310,8 @@ class _Training:
     def _compile(self) -> CompiledChunk:
         """Compile a chunk; refuse what does not fit into memory."""
         say("compiling ...", end="", flush=True)
-        with ThreadPoolExecutor(1) as beside:
-            others = beside.submit(self._compile_others)
-            with watched_compilation() as was_read:
-                compiled, seconds = compile_chunk(self._env_params, self._program)
-            others.result()
+        with watched_compilation() as was_read:
+            compiled, seconds = compile_chunk(self._env_params, self._program)
         self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
         how = "compiled earlier, read" if was_read() else "compiled"
         say(f"{how} in {seconds:.1f} s", start="\r")
@@ -335,11 +326,6 @@ class _Training:
             return runner, metrics
 
         return run_chunk
-
-    def _compile_others(self) -> None:
-        """What runs before training and after it; compiled by another core meanwhile."""
-        compile_start(self._program)
-        final_evaluation.prepare(self._config, self._first_map)
 
     def _write_row(self, report: ChunkReport) -> dict[str, Any]:
         """Update the timing by a chunk, and write its row of metrics."""

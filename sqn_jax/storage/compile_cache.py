@@ -12,7 +12,6 @@ import re
 import shutil
 import stat
 import sys
-import threading
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -77,16 +76,11 @@ def cached_programs() -> Iterator[None]:
 
 @contextmanager
 def watched_compilation() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether all that was compiled meanwhile came from the cache.
-
-    What other threads compile does not count.
-    """
+    """Yield a function that returns whether all that was compiled meanwhile came from the cache."""
     seen: Counter[str] = Counter()
-    own_thread = threading.get_ident()
 
     def note(event: str, **_: object) -> None:
-        if threading.get_ident() == own_thread:
-            seen[event.removeprefix("/jax/compilation_cache/")] += 1
+        seen[event.removeprefix("/jax/compilation_cache/")] += 1
 
     jax.monitoring.register_event_listener(note)
     try:
@@ -162,32 +156,19 @@ def _tidy(folder: Path) -> None:
 
 @contextmanager
 def _sealed(folder: Path) -> Iterator[None]:
-    """Put a checksum beside every program as soon as it is written: the run may be killed.
-
-    While another thread compiles, and may be in the middle of writing, they wait.
-    """
-    compiling: set[int] = set()
-
-    def begin(event: str, *_: object, **__: object) -> None:
-        if event.endswith("compile_duration"):
-            compiling.add(threading.get_ident())
+    """Put a checksum beside every program as soon as it is written: the run may be killed."""
 
     def seal(event: str, *_: object, **__: object) -> None:
-        if not event.endswith("compile_duration"):
-            return
-        compiling.discard(threading.get_ident())
-        for entry in folder.glob(f"*{ENTRY}") if not compiling else ():
+        for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
             with suppress(OSError, ValueError):
                 if not _seal_of(entry).exists():
                     _seal_of(entry).write_bytes(_digest(entry))
 
-    jax.monitoring.register_scalar_listener(begin)
     jax.monitoring.register_event_duration_secs_listener(seal)
     try:
         yield
     finally:
         jax.monitoring.unregister_event_duration_listener(seal)
-        jax.monitoring.unregister_scalar_listener(begin)
 
 
 def _seal_of(entry: Path) -> Path:

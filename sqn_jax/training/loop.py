@@ -198,11 +198,6 @@ def start_run(program: Program) -> RunnerState:
     return place(_start_run(program), program.mesh, runner_specs(program))
 
 
-def compile_start(program: Program) -> None:
-    """Compile what `start_run` runs, without running it: a replay would fill the memory."""
-    _start_run.lower(program).compile()
-
-
 @partial(jax.jit, static_argnames="program")
 def _start_run(program: Program) -> RunnerState:
     config = program.config
