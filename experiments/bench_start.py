@@ -131,7 +131,12 @@ def measured(command: list[str], out: Path) -> int:
         )
         train.run = loop.run  # type: ignore[attr-defined]
     spans.add(started, time.monotonic(), "import")
-    code = cli.main(command or ["--help"])
+    sys.argv = ["sqn", *command]
+    code: Any = None
+    try:
+        cli.run()
+    except SystemExit as stop:
+        code = stop.code
     whole = time.monotonic() - started
     seconds: dict[str, float] = defaultdict(float)
     programs: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
@@ -143,7 +148,7 @@ def measured(command: list[str], out: Path) -> int:
     known = sum(own for is_own, _, _, own in spans.own() if is_own)
     seconds["other"] = whole - known
     out.write_text(json.dumps({"seconds": seconds, "programs": programs}), encoding="utf-8")
-    return code
+    return int(code or 0)
 
 
 def run_once(command: list[str], cache: Path) -> dict[str, Any]:
