@@ -33,7 +33,7 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
     """
     mesh = devices.choose(config)
     program = loop.make_program(env_params, config, mesh)
-    runner = loop.start_run(env_params, program)
+    runner = loop.start_run(program)
     compiled, compile_seconds = loop.compile_chunk(env_params, program)
     env_params = devices.place(env_params, mesh)
     warm_up = 0.0
@@ -73,14 +73,14 @@ def memory(config: TrainConfig, env_params: EnvParams) -> dict[str, int]:
     `replay_bytes` is the replay (0 without one), `run_bytes` adds the episodes of one round.
     """
     program = loop.make_program(env_params, config)
-    item = r2d2.packed_item(trajectory_shapes(env_params, program))
+    item = r2d2.packed_item(trajectory_shapes(program))
     has_replay = config.method == "r2d2"
     capacity = config.replay.capacity if has_replay else 0
     return {
         "peak_process_bytes": peak_bytes(),
         "replay_episodes": capacity,
         "replay_bytes": replay.num_bytes(item, capacity) if has_replay else 0,
-        "run_bytes": memory_bytes(env_params, program),
+        "run_bytes": memory_bytes(program),
     }
 
 

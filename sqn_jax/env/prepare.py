@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -200,14 +201,21 @@ def _ray_grid(
             f"the map has {height} x {width} cells, expected fewer than {2**31 // sectors:,} "
             f"with env.ray_sectors {sectors}"
         )
-    sides = far_sides(free_rectangles(blocked, sectors, reach))
     return RayGrid(
-        far_sides=jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1)),
+        far_sides=_table(blocked.tobytes(), blocked.shape, sectors, reach),
         first_entry=jnp.int32(0),
         resolution=jnp.float32(resolution),
         width=jnp.int32(width),
         sectors=sectors,
     )
+
+
+@lru_cache(maxsize=2)
+def _table(blocked: bytes, shape: tuple[int, int], sectors: int, reach: int) -> Array:
+    """The table of a `RayGrid`; those of the last map are kept, for its other kinds of tasks."""
+    cells = np.frombuffer(blocked, np.bool_).reshape(shape)
+    sides = far_sides(free_rectangles(cells, sectors, reach))
+    return jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1))
 
 
 def _groups(parts: NDArray[np.int64]) -> NDArray[np.int64]:

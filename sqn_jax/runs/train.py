@@ -93,7 +93,7 @@ def train_session(
     _warn_of_short_episodes(occupancy_map, config)
     program = make_program(env_params, config, mesh)
     # Errors up to here leave no files behind.
-    num_bytes = memory_bytes(env_params, program)
+    num_bytes = memory_bytes(program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
     final_evaluation.require_memory(program)
     if tensorboard:
@@ -105,7 +105,7 @@ def train_session(
         stack.enter_context(locked(run_dir))
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
-        runner = _restored(env_params, program, folder, checkpoints) if resume else None
+        runner = _restored(program, folder, checkpoints) if resume else None
         _announce(program, run_dir, num_bytes, resume_command)
         done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
@@ -182,9 +182,7 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: s
         say(f"if it is stopped, resume with {resume_command}", flush=True)
 
 
-def _restored(
-    env_params: EnvParams, program: Program, folder: RunFolder, checkpoints: Checkpoints
-) -> RunnerState | None:
+def _restored(program: Program, folder: RunFolder, checkpoints: Checkpoints) -> RunnerState | None:
     """The state to resume from; None if the run was stopped before its first checkpoint.
 
     Also writes the config to the folder and drops the metrics of chunks after the checkpoint.
@@ -193,7 +191,7 @@ def _restored(
     runner, chunks = None, 0
     folder.sweep()
     if checkpoints.chunks():
-        runner, saved = checkpoints.restore(runner_shapes(env_params, program))
+        runner, saved = checkpoints.restore(runner_shapes(program))
         chunks = rounds_done(runner) // config.rounds_per_chunk
         if chunks > config.num_chunks:
             episodes = chunks * config.rounds_per_chunk * config.num_envs
@@ -205,7 +203,7 @@ def _restored(
         _report_changes(saved, 1 if program.mesh is None else program.mesh.size)
         if config.method == "r2d2" and runner.learner.memory is None:
             say("saved without the replay: resuming with an empty one, not exactly as before")
-            memory = start_run(env_params, program).learner.memory
+            memory = start_run(program).learner.memory
             learner = dataclasses.replace(runner.learner, memory=memory)
             runner = dataclasses.replace(runner, learner=learner)
     else:
@@ -289,7 +287,7 @@ class _Training:
             return runner
         compiled = self._compile()
         if runner is None:
-            runner = start_run(self._env_params, self._program)
+            runner = start_run(self._program)
             if self._start is not None:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs

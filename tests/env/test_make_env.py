@@ -50,6 +50,20 @@ def test_a_map_may_come_from_a_file_or_from_memory_and_is_the_same(tmp_path: Pat
     np.testing.assert_array_equal(from_file.spawn_positions, from_memory.spawn_positions)
 
 
+def test_the_tables_of_a_map_are_made_once_for_all_its_kinds_of_tasks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prepare._table.cache_clear()
+    made = []
+    far_sides = prepare.far_sides
+    monkeypatch.setattr(prepare, "far_sides", lambda x: made.append(x.shape) or far_sides(x))
+    turned = wrap_map(open_map(rows=60, columns=40), [(1.0, 1.0), (1.0, 2.0)], max_steps=33)
+    for occupancy_map in (small_map(), turned):
+        make_env(occupancy_map, spawn="training")
+        make_env(occupancy_map, spawn="evaluation")
+    assert made == [(32, 40, 60), (8, 40, 60), (32, 60, 40), (8, 60, 40)]
+
+
 def test_a_robot_too_large_for_the_map_is_refused(tmp_path: Path) -> None:
     save_map(small_map(), tmp_path / "small.yaml")
     config = EnvConfig(robot_radius=1.5)

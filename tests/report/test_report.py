@@ -355,7 +355,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
     folder = RunFolder.create(path, config)
     with compiling_quickly():
         world = make_env(load_map(room_file), config.env)
-        runner = start_run(world, make_program(world, config))
+        runner = start_run(make_program(world, config))
         with Checkpoints(path, Origin(config)) as checkpoints:
             checkpoints.save(1, runner)
         for chunk in (1, 2):
