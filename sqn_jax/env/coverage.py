@@ -262,7 +262,8 @@ def _draw(rows: Array, starts: Array, sectors: Array) -> list[Array]:
 
     def draw_next(index: Array | int, carry: Any) -> Any:
         part = jax.lax.dynamic_slice_in_dim(sectors, index * block, block, axis=1)
-        return draw(*carry, part)
+        begin, bitmasks = carry
+        return draw(begin, bitmasks, part)
 
     _, bitmasks = repeat(num_blocks, draw_next, (begin, nothing), unroll=1)
     return [bitmask[::-1].reshape(-1) for bitmask in bitmasks]
