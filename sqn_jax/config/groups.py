@@ -45,7 +45,7 @@ class EnvConfig:
     """Steps an episode; 0 takes the map's own limit (400, in the cave 1200)."""
     coverage_cell: float = 0.325
     """Distance of the points on which the covered area is counted, m."""
-    ray_sectors: int = 32
+    ray_sectors: int = 8
     """Directions in the free-space table of the ray caster; a multiple of 4."""
     ray_iterations: int = 8
     """Free rectangles a ray may cross before its reading is cut short."""

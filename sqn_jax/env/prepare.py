@@ -194,7 +194,8 @@ def _velocity_noise(config: EnvConfig) -> Array:
 def _ray_grid(
     blocked: NDArray[np.bool_], resolution: float, sectors: int, reach_m: float
 ) -> RayGrid:
-    reach = min(math.ceil(reach_m / resolution), 127)  # What a signed byte holds.
+    # A rectangle is up to a cell longer; a signed byte holds 127.
+    reach = min(math.ceil(reach_m / resolution), 126)
     height, width = blocked.shape
     if sectors * height * width >= 2**31 or 128 * width > LARGEST_INTEGER:
         raise ValueError(

@@ -29,7 +29,7 @@ from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import probe_writable, written_whole
 
 MOST_EPISODES = 32
-"""Per policy; an episode in the cave takes 7 MB of memory."""
+"""Per policy; an episode in the cave takes 9 MB of memory."""
 
 EpisodesByAgent = Mapping[str, list[Episode]]
 

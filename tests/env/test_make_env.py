@@ -169,3 +169,19 @@ def test_neighbours_are_the_nearest_points_and_of_two_as_near_the_first() -> Non
         others = [other for other in group if other != index]
         others.sort(key=lambda other: math.dist(points[other], points[index]))
         assert found[index].tolist() == others[:4]
+
+
+def test_on_fine_cells_the_far_sides_fit_their_bytes() -> None:
+    """5 m are 200 cells of 25 mm, more than a signed byte holds."""
+    occupied = open_map(290, 310)
+    fine = make_env(wrap_map(occupied, [(1.0, 1.0), (2.0, 2.0)], resolution=0.025))
+    sides = np.asarray(fine.sight.far_sides).reshape(290, 310, -1)[1:-1, 1:-1]
+    columns, rows = (sides << 8).astype(np.int16) >> 8, sides >> 8
+    # The sectors of the first quadrant look toward +x, +y, those of the third toward -x, -y.
+    quarter = sides.shape[-1] // 4
+    assert min(columns[..., :quarter].min(), rows[..., :quarter].min()) >= 1
+    assert (
+        max(columns[..., 2 * quarter : -quarter].max(), rows[..., 2 * quarter : -quarter].max())
+        <= 0
+    )
+    assert max(columns.max(), rows.max()) > 120
