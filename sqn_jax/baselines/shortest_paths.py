@@ -144,12 +144,12 @@ class ShortestPaths:
         """`steps_left` from poses [3, ...] whose cells are known."""
         free_cell = self.index.reshape(-1)[cell]
         ahead = self._table.reshape(-1, 3)[self.which[robots] * len(self.centers) + free_cell]
-        length, direction, bends = np.moveaxis(ahead, -1, 0)
+        length, direction, bends = np.moveaxis(ahead, -1, 0).astype(np.float64)
         row, col = np.divmod(cell, len(self.index[0]))
         # From the cell's center to the place itself.
         away_x = pose[0] - (col + 0.5) * self.resolution
         away_y = pose[1] - (row + 0.5) * self.resolution
-        length = length - (away_x * np.cos(direction) + away_y * np.sin(direction))
+        length -= away_x * np.cos(direction) + away_y * np.sin(direction)
         off = np.abs(wrapped_once(pose[2] - direction)) / self.turn
         in_reverse = np.pi / self.turn - off + np.maximum(length, 0) * (1 / backward - 1 / forward)
         return length / forward + np.minimum(off, in_reverse) + bends

@@ -208,17 +208,14 @@ def _batches(
 
     `paths` caches the lengths of the shortest paths, m, by task; None where they are not searched.
     """
-    robot_radius = world.env_params.config.robot_radius
     eval_seeds = settings.all_eval_seeds
     at_once = max(1, EPISODES_AT_ONCE // settings.episodes)
     for first in range(0, len(eval_seeds), at_once):
         block = eval_seeds[first : first + at_once]
         results = agent.run(block, world, settings, fields, on_batch)
-        of_seeds = zip(product(block, agent.training_seeds), chain(*results), strict=True)
+        of_seeds = list(zip(product(block, agent.training_seeds), chain(*results), strict=True))
+        _search_paths(paths, world, [(starts, goals) for _, (_, starts, goals, _) in of_seeds])
         for (eval_seed, training_seed), (metrics, starts, goals, trajectory) in of_seeds:
-            tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
-            if tasks not in paths:
-                paths[tasks] = _shortest_paths(world.occupancy_map, starts, goals, robot_radius)
             yield EpisodeBatch(
                 agent=agent,
                 world=world,
@@ -227,9 +224,31 @@ def _batches(
                 metrics=dict(zip(settings.goal_radii, metrics, strict=True)),
                 starts=starts,
                 goals=goals,
-                shortest_paths=paths[tasks],
+                shortest_paths=paths[_task_name(world, starts, goals)],
                 trajectory=trajectory,
             )
+
+
+def _task_name(world: World, starts: Floats, goals: Floats) -> bytes:
+    return world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
+
+
+def _search_paths(
+    paths: dict[bytes, NDArray[np.float64] | None],
+    world: World,
+    tasks: Sequence[tuple[Floats, Floats]],
+) -> None:
+    """Add the shortest paths of tasks that are not there yet, all goals of a map at once."""
+    new = {_task_name(world, *task): task for task in tasks}
+    new = {name: task for name, task in new.items() if name not in paths}
+    if not new:
+        return
+    starts, goals = (np.concatenate(each) for each in zip(*new.values(), strict=True))
+    robot_radius = world.env_params.config.robot_radius
+    lengths = _shortest_paths(world.occupancy_map, starts, goals, robot_radius)
+    ends = np.cumsum([len(own_goals) for _, own_goals in new.values()])
+    split = [None] * len(new) if lengths is None else np.split(lengths, ends[:-1])
+    paths.update(zip(new, split, strict=True))
 
 
 def _shortest_paths(
