@@ -65,6 +65,10 @@ class Oracle:
         """Where the robots are before each of these actions; NaN where nothing is planned."""
         self.before: tuple[Floats, Ints] | None = None
 
+    def prepare(self, poses: Floats) -> None:
+        """Plan from the first poses [E, 3], which `choose` will get: beside other work, say."""
+        self._plan(np.arange(len(poses)), poses)
+
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
         self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.search.goal_radius

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Protocol
 
@@ -95,6 +96,25 @@ def oracle(occupancy_map: OccupancyMap, env_params: EnvParams) -> Navigator:
         cannot move or turn.
     """
     return planned(lambda goals: Oracle(occupancy_map, env_params, goals))
+
+
+def oracle_ahead(keys: Array, occupancy_map: OccupancyMap, env_params: EnvParams) -> Navigator:
+    """The oracle, which plans the episodes of these keys beside whatever else is done.
+
+    It is at work when this returns, in a thread of its own; the episodes must be those of the keys.
+    """
+    _, first = start_by_hand(keys, env_params)
+    goals, poses = jax.device_get((first.env_state.goal, first.env_state.pose))
+
+    def plan() -> Oracle:
+        oracle = Oracle(occupancy_map, env_params, goals.astype(np.float64))
+        oracle.prepare(poses.astype(np.float64))
+        return oracle
+
+    thread = ThreadPoolExecutor(1)
+    planner = thread.submit(plan)
+    thread.shutdown(wait=False)
+    return planned(lambda _: planner.result())
 
 
 def planned(make: Callable[[NDArray[np.float64]], Planner]) -> Navigator:
@@ -227,8 +247,19 @@ def _unroll_batch(
         )
         chunk = jax.device_get(chunk.only(*JUDGED, *fields))
         chunks.append(jax.tree.map(lambda x, n=length - begin: x[:n], chunk))
+        if plan is not None and _stands(chunk, plan[begin + CHUNK :], env_params.config):
+            # All further steps are as the last.
+            rest = max(0, length - begin - CHUNK)
+            chunks.append(jax.tree.map(lambda x, n=rest: np.repeat(x[-1:], n, axis=0), chunk))
+            break
     joined = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
     return jax.device_get(with_ends(joined, first, actors))
+
+
+def _stands(chunk: Trajectory, plan: NDArray[np.int32], config: EnvConfig) -> bool:
+    """Whether robots stood still at the end of a chunk, and will, and see the same each time."""
+    stood = (chunk.poses[-1] == chunk.poses[-2]).all()
+    return bool(stood and (plan == STAND).all() and config.range_noise == 0)
 
 
 @partial(jax.jit, static_argnames="bug")
