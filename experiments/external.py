@@ -90,8 +90,8 @@ def main() -> None:
     if not files:
         raise ValueError(f"{options.folder}: no suite, expected files ending in .json")
     names = options.policies or [f"pretrained:{name}" for name in pretrained_names()]
-    robot = EnvConfig()
     policies = [TrainedAgent(name, (find_policy(name),)) for name in names]
+    robot = policies[0].env_config
     settings = SuiteSettings(eval_seeds=options.eval_seeds)
     suites: dict[str, Any] = {}
     for file in files:

@@ -162,7 +162,9 @@ def chunks(
     max_steps = max(task.max_steps for task in suite.tasks)
     for names in _groups(cells):
         maps = [load(name) for name in names]
-        worlds = [with_noise(make_env(occupancy_map, robot), *noise) for occupancy_map in maps]
+        with ThreadPoolExecutor(num_cores()) as threads:
+            made = threads.map(partial(make_env, config=robot), maps)
+            worlds = [with_noise(world, *noise) for world in made]
         numbers = np.concatenate([tasks_of[name] for name in names])
         which = np.repeat(np.arange(len(names)), [len(tasks_of[name]) for name in names])
         tasks = [suite.tasks[number] for number in numbers]

@@ -60,6 +60,20 @@ def test_nothing_has_no_interval() -> None:
         wilson_interval(0, 0)
 
 
+@pytest.mark.parametrize(("successes", "trials"), [(0, 1), (1, 1), (0, 7), (3, 40), (500, 500)])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.99])
+def test_the_wilson_interval_is_scipy_s(successes: int, trials: int, confidence: float) -> None:
+    theirs = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    assert wilson_interval(successes, trials, confidence) == pytest.approx(tuple(theirs), abs=1e-12)
+
+
+def test_the_interquartile_mean_is_scipy_s_trimmed_mean() -> None:
+    rng = np.random.default_rng(3)
+    for count in (1, 3, 4, 5, 6, 7, 101):
+        scores = rng.random((count, 2))
+        assert interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores.ravel(), 0.25))
+
+
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
     assert interquartile_mean([100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, -90.0]) == pytest.approx(3.5)
     # Five values: one and a quarter rounds down to one at each end.
