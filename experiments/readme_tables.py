@@ -16,19 +16,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import recorded, run
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.statistics import sample_std
+from sqn_jax.evaluation.suite_scores import worst_tenth
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/RESULTS.md", "docs/LAB_NOTES.md", "docs/DEPLOYMENT.md")
+PAGES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT")),
+)
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
 """Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
 RADIUS = 0.3
+BENCHMARK = "benchmark.json"
+STARTS = ("start_smoke.json", "start_evaluate.json", "start_render.json")
 
 Entry = dict[str, Any]
 
@@ -113,18 +120,27 @@ def quick() -> str:
 
 
 def external() -> str:
-    """Policies and baselines on suites from elsewhere: success, and the worst tenth of the maps."""
-    suites = recorded("external.json")["suites"]
+    """Policies and baselines on suites from elsewhere: success, worst tenth of the maps, SPL."""
+    return _suites("external.json")
+
+
+def fresh() -> str:
+    """The same on fresh procedural maps, one hard task each."""
+    return _suites("fresh.json")
+
+
+def _suites(name: str) -> str:
+    suites = recorded(name)["suites"]
     names = [row["agent"] for row in next(iter(suites.values()))]
     rows = [
         [f"{suite} ({rows[0]['num_tasks']} tasks)", *(_with_worst(row) for row in rows)]
         for suite, rows in suites.items()
     ]
-    return markdown_table(["success, worst tenth", *names], rows)
+    return markdown_table(["success, worst tenth, SPL", *names], rows)
 
 
 def _with_worst(row: Entry) -> str:
-    return f"{row['success']['mean']:.2f}, {row['worst_tenth']:.2f}"
+    return f"{row['success']['mean']:.2f}, {worst_tenth(row):.2f}, {row['spl']['mean']:.2f}"
 
 
 def sensors() -> str:
@@ -144,9 +160,53 @@ def _with_collisions(entry: Entry) -> str:
     return f"{entry['success']:.2f}, {entry['collisions']:.1f}"
 
 
+def simulator() -> str:
+    """Steps a second with random actions; JaxNav without its reset in every step."""
+    entries = recorded(BENCHMARK)["simulator"]
+    return bench_simulator.table([e for e in entries if "reset" not in e["program"]])
+
+
+def breakdown() -> str:
+    """Where the time of a step goes."""
+    return bench_breakdown.table(recorded(BENCHMARK)["breakdown"])
+
+
+def training() -> str:
+    """The whole training program."""
+    return bench_train.table(recorded(BENCHMARK)["train"])
+
+
+def learner() -> str:
+    """R2D2 updates of the preset `paper`, with both cores."""
+    results = recorded(BENCHMARK)["learner"]
+    programs = ("JAX, 2 devices", "PyTorch, 2 threads")
+    updates = [entry for entry in results["updates"] if entry["program"] in programs]
+    return bench_learner.table({**results, "updates": updates})
+
+
+def starts() -> str:
+    """Seconds of commands, and where they go when all programs have been compiled before."""
+    rows = []
+    for name in STARTS:
+        record = recorded(name)
+        parts = [f"{kind} {seconds:.1f}" for kind, seconds in record["warm"]["seconds"].items()]
+        rows.append(
+            [
+                f"`sqn {' '.join(record['command'])}`",
+                *(f"{record[each]['whole']:.1f}" for each in ("cold", "warm")),
+                ", ".join(parts[:5]),
+            ]
+        )
+    header = ["command", "first time, s", "later, s", "of the latter"]
+    return markdown_table(header, rows)
+
+
 TABLES = {
     each.__name__: each
-    for each in (agents, policies, quick, seeds, paper, dead_ends, noise, external, sensors)
+    for each in (
+        *(agents, policies, quick, seeds, paper, dead_ends, noise, external, fresh, sensors),
+        *(simulator, breakdown, training, learner, starts),
+    )
 }
 
 
