@@ -16,9 +16,14 @@ import numpy as np
 
 from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps.kinds.cave import cave
+from sqn_jax.maps.kinds.clutter import clutter
 from sqn_jax.maps.kinds.column import column
+from sqn_jax.maps.kinds.corridors import corridors
+from sqn_jax.maps.kinds.courtyard import courtyard
 from sqn_jax.maps.kinds.forest import forest
 from sqn_jax.maps.kinds.maze import maze
+from sqn_jax.maps.kinds.rooms import rooms
+from sqn_jax.maps.kinds.track import track
 from sqn_jax.maps.occupancy import OccupancyMap
 
 _MAKERS: dict[str, Callable[[str, np.random.Generator], OccupancyMap]] = {
@@ -26,6 +31,11 @@ _MAKERS: dict[str, Callable[[str, np.random.Generator], OccupancyMap]] = {
     "column": column,
     "forest": forest,
     "cave": cave,
+    "rooms": rooms,
+    "corridors": corridors,
+    "track": track,
+    "clutter": clutter,
+    "courtyard": courtyard,
 }
 
 

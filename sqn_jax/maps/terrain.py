@@ -90,6 +90,34 @@ def asterisk(
     return where, cells
 
 
+def boxes(
+    size: int,
+    center: ArrayLike,
+    turn: float,
+    sides: Sequence[tuple[float, float, float, float]],
+    margin: float = 0.0,
+) -> Window:
+    """Boxes that turn together about a center: the cells whose centers lie in one.
+
+    Args:
+        size: cells a side.
+        center: (x, y), m.
+        turn: rad, counter-clockwise.
+        sides: of each (left, right, bottom, top) in m from the center, before it is turned.
+        margin: m by which every box is wider on each of its sides.
+    """
+    # As far as the farthest corner of a box around all, which is wider by the margin.
+    reach = math.hypot(*np.abs(np.asarray(sides)).reshape(-1, 2, 2).max(axis=(0, 2)) + margin)
+    where, x, y = _window(size, center, reach)
+    cos, sin = math.cos(turn), math.sin(turn)
+    along, across = x * cos + y * sin, y * cos - x * sin
+    cells = np.zeros(along.shape, dtype=bool)
+    for left, right, bottom, top in sides:
+        inside = (along >= left - margin) & (along <= right + margin)
+        cells |= inside & (across >= bottom - margin) & (across <= top + margin)
+    return where, cells
+
+
 def round_crooks(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A copy with everything filled where no disc of radius 0.16 m fits in.
 

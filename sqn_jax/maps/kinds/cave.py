@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.maps.kinds.placing import uniform
-from sqn_jax.maps.kinds.plan import add_loops, grow_tree, path_lengths
+from sqn_jax.maps.kinds.plan import add_loops, grow_tree, path_lengths, prune
 from sqn_jax.maps.occupancy import OccupancyMap
 from sqn_jax.maps.terrain import CAVE_SIZE, RESOLUTION, carve_tunnels, finish_map
 
@@ -22,13 +22,7 @@ def cave(name: str, rng: np.random.Generator) -> OccupancyMap:
     side = _SIDE
     pitch = CAVE_SIZE * RESOLUTION / side
     edges = grow_tree(side, rng)
-    places = set(range(side * side))
-    for _ in range(_LEFT_OUT):
-        joined = np.bincount(np.array(sorted(edges)).ravel(), minlength=side * side)
-        leaves = np.flatnonzero(joined == 1)
-        left_out = int(leaves[rng.integers(len(leaves))])
-        places.discard(left_out)
-        edges = {edge for edge in edges if left_out not in edge}
+    edges, places = prune(edges, side, _LEFT_OUT, rng)
     edges = add_loops(edges, places, side, _LOOPS, rng)
     grid = np.stack(np.divmod(np.arange(side * side), side)[::-1], axis=-1)
     nodes = (grid + 0.5 + 0.5 * (rng.random((side * side, 2)) - 0.5)) * pitch

@@ -7,14 +7,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.terrain import Window
-
-_GAP = 0.7  # m, at least, between two obstacles in the open
-_TRIES = 400  # places tried for obstacles in the open
+from sqn_jax.maps.terrain import RESOLUTION, Window
 
 
 def uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A number between two, each as likely."""
     return low + (high - low) * float(rng.random())
+
+
+def in_cells(rng: np.random.Generator, low: float, high: float) -> int:
+    """A length between two in m, in whole cells."""
+    return round(uniform(rng, low, high) / RESOLUTION)
 
 
 def place_obstacles(
@@ -22,15 +25,24 @@ def place_obstacles(
     keep_free: NDArray[np.bool_],
     draw: Callable[[], Callable[[float], Window]],
     most: int,
+    *,
+    gap: float = 0.7,
+    tries: int = 400,
 ) -> None:
-    """Add up to `most` obstacles to `occupied`, `_GAP` apart and none on `keep_free`.
+    """Add up to `most` obstacles to `occupied`, some way apart and none on `keep_free`.
 
-    `draw` gives an obstacle at random: from a margin in m, its cells with so much around them.
+    Args:
+        occupied: bool [size, size], changed in place.
+        keep_free: bool [size, size].
+        draw: gives an obstacle at random: from a margin in m, its cells with so much around them.
+        most: how many are added at most.
+        gap: m, at least, from an obstacle to what stands already.
+        tries: how many are drawn at most.
     """
     placed = 0
-    for _ in range(_TRIES):
+    for _ in range(tries):
         obstacle = draw()
-        where, wide = obstacle(_GAP)
+        where, wide = obstacle(gap)
         if (occupied[where] & wide).any():
             continue
         where, cells = obstacle(0.0)

@@ -10,24 +10,35 @@ from scipy.sparse.csgraph import dijkstra
 Edge = tuple[int, int]
 
 
-def grow_tree(side: int, rng: np.random.Generator) -> set[Edge]:
+def grow_tree(
+    side: int, rng: np.random.Generator, *, last: float = 0.6, straight: float = 0.0
+) -> set[Edge]:
     """A random tree over a square of side x side places: edges (a, b), a < b, row * side + col.
 
-    Grown from the place reached last (long paths) or from any reached so far (short dead ends).
+    Args:
+        side: places a side.
+        rng: what decides.
+        last: how often it grows from the place reached last (long paths); else from any reached so
+            far (short dead ends).
+        straight: how often it grows on in the direction in which that place was reached.
     """
     edges: set[Edge] = set()
     active = [int(rng.integers(side * side))]
-    reached = set(active)
+    reached = {active[0]: active[0]}  # And from where.
     while active:
-        index = len(active) - 1 if rng.random() < 0.6 else int(rng.integers(len(active)))
+        index = len(active) - 1 if rng.random() < last else int(rng.integers(len(active)))
         place = active[index]
         new = [other for other in beside(place, side) if other not in reached]
         if not new:
             active.pop(index)
             continue
-        other = new[int(rng.integers(len(new)))]
+        ahead = 2 * place - reached[place]
+        if straight and ahead in new and rng.random() < straight:
+            other = ahead
+        else:
+            other = new[int(rng.integers(len(new)))]
         edges.add((min(place, other), max(place, other)))
-        reached.add(other)
+        reached[other] = place
         active.append(other)
     return edges
 
@@ -37,6 +48,20 @@ def beside(place: int, side: int) -> list[int]:
     row, col = divmod(place, side)
     beside = [(row, col - 1), (row, col + 1), (row - 1, col), (row + 1, col)]
     return [r * side + c for r, c in beside if 0 <= r < side and 0 <= c < side]
+
+
+def prune(
+    edges: set[Edge], side: int, count: int, rng: np.random.Generator
+) -> tuple[set[Edge], set[int]]:
+    """The tree without `count` of its leaves, one after the other, and the places that are left."""
+    places = set(range(side * side))
+    for _ in range(count):
+        joined = np.bincount(np.array(sorted(edges)).ravel(), minlength=side * side)
+        leaves = np.flatnonzero(joined == 1)
+        left_out = int(leaves[rng.integers(len(leaves))])
+        places.discard(left_out)
+        edges = {edge for edge in edges if left_out not in edge}
+    return edges, places
 
 
 def add_loops(
