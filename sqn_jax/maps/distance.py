@@ -263,7 +263,7 @@ def grid_path(
     targets = (cells[:, 0] + 1) * width + cells[:, 1] + 1
     wave = np.array([(start[0] + 1) * width + start[1] + 1])
     open_cells[wave] = False
-    steps = np.zeros(len(cells), np.int64)
+    steps = np.zeros(len(open_cells), np.int64)
     mark = np.zeros(len(open_cells), np.int32)
     count = 0
     while len(wave) and open_cells[targets].any():
@@ -275,5 +275,5 @@ def grid_path(
         mark[around] = order
         wave = around[mark[around] == order]
         open_cells[wave] = False
-        steps[np.isin(targets, wave) & (steps == 0)] = count
-    return steps
+        steps[wave] = count
+    return steps[targets]

@@ -250,11 +250,13 @@ def spread(cells: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
     Farthest-point sampling, in whole numbers and so the same everywhere.
     """
+    rows, cols = cells.T.copy()
     chosen = [0]
-    nearest = ((cells - cells[0]) ** 2).sum(axis=1)
+    nearest = (rows - rows[0]) ** 2 + (cols - cols[0]) ** 2
     while len(chosen) < count and nearest.max() > 0:
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, ((cells - cells[chosen[-1]]) ** 2).sum(axis=1))
+        last = int(nearest.argmax())
+        chosen.append(last)
+        np.minimum(nearest, (rows - rows[last]) ** 2 + (cols - cols[last]) ** 2, out=nearest)
     return cells[chosen]
 
 
