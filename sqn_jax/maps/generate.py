@@ -43,14 +43,19 @@ def generate(kind: str, seed: int) -> OccupancyMap:
     """The map of a kind that belongs to a seed.
 
     Args:
-        kind: "maze" (17 x 17 m, corridors about 2 m wide), "column" (17 x 17 m, round pillars
-            around an open middle), "forest" (17 x 17 m, asterisks) or "cave" (51 x 51 m, rough
-            tunnels).
+        kind: like the project's own maps are "maze" (17 x 17 m, corridors about 2 m wide), "column"
+            (17 x 17 m, round pillars around an open middle), "forest" (17 x 17 m, asterisks) and
+            "cave" (51 x 51 m, rough tunnels). Of 12.5 or 25 m a side and of proportions that
+            differ from seed to seed are "rooms" (houses and offices), "corridors" (narrow or wide,
+            thin or thick walls), "track" (one course, a loop or with two ends), "clutter" (posts
+            and boxes in a field) and "courtyard" (open ground between buildings); their functions
+            in `maps.kinds` name the ranges.
         seed: any whole number >= 0.
 
     Returns:
         The map, named kind-seed: 0.05 m a cell, spawn points all over, four evaluation points in a
-        maze and two (start, goal) in the others, 400 steps an episode, 1200 in a cave.
+        maze and two (start, goal) in the others. Episodes take 400 steps, 1200 in a cave, and in
+        the kinds of changing size as many as their longest path asks for, 400 at least.
 
     Raises:
         ValueError: an unknown kind, or a seed that is not a whole number >= 0.

@@ -89,7 +89,7 @@ def rooms(name: str, rng: np.random.Generator) -> OccupancyMap:
 
 
 def _draw_style(rng: np.random.Generator) -> Style:
-    narrow = in_cells(rng, 0.5, 0.9)
+    narrow = in_cells(rng, 0.5, uniform(rng, 0.5, 0.9))
     wide = in_cells(rng, narrow * RESOLUTION, 1.2)
     return Style(
         wall=in_cells(rng, 0.1, 0.25) if rng.random() < 0.75 else in_cells(rng, 0.25, 0.5),
