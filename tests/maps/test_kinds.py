@@ -71,14 +71,13 @@ def test_a_map_is_one_closed_region_with_points_all_over(kind: str, seed: int) -
     assert away.max() < 3.5
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["rooms", "corridors", "track"])
 def test_the_goal_is_far_and_can_be_reached_in_half_an_episode(kind: str) -> None:
-    drawn = next(made(kind, seed) for seed in range(12) if made(kind, seed).shape[0] == 250)
+    drawn = max((made(kind, seed) for seed in range(12)), key=lambda each: each.max_steps)
     start, goal = drawn.evaluation_points
     steps = steps_between(drawn, start, goal)[0]
-    assert 30 <= steps <= drawn.max_steps / 2
+    assert 150 <= steps <= drawn.max_steps / 2
     assert drawn.max_steps % 100 == 0
-    assert drawn.max_steps >= 400
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -86,9 +85,9 @@ def test_the_seed_decides(kind: str) -> None:
     again = generate(kind, 1)
     assert again.identity() == made(kind, 1).identity()
     assert len({made(kind, seed).occupied.tobytes() for seed in range(12)}) == 12
-    # Of both sizes, and no episode is longer than in a cave.
+    # Of both sizes; no episode is shorter than in a maze or longer than in a cave.
     assert {made(kind, seed).shape[0] for seed in range(12)} == {250, 500}
-    assert max(made(kind, seed).max_steps for seed in range(12)) <= 1200
+    assert all(400 <= made(kind, seed).max_steps <= 1200 for seed in range(12))
 
 
 @pytest.mark.parametrize("kind", ["rooms", "corridors"])
@@ -117,7 +116,7 @@ def test_a_square_of_half_a_meter_gets_into_all_rooms_and_past_the_furniture(see
     assert pieces(ndimage.binary_erosion(~made("rooms", seed).occupied, square(0.5))) == 1
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(30))
 def test_corridors_are_as_wide_as_they_should_be(seed: int) -> None:
     free = ~made("corridors", seed).occupied
     np.testing.assert_array_equal(ndimage.binary_opening(free, square(0.6)), free)
