@@ -17,8 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-KINDS = ("maze", "column", "forest", "cave")
-"""Kinds of procedural maps."""
+KINDS = (
+    *("maze", "column", "forest", "cave"),
+    *("rooms", "corridors", "track", "clutter", "courtyard"),
+)
+"""Kinds of procedural maps; what is drawn from a seed may count on their order."""
 
 MAX_SEED = 999_999_999
 

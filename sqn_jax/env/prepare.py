@@ -21,6 +21,7 @@ from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
     MAX_CELLS,
+    MAX_CELLS_TOGETHER,
     OccupancyMap,
     cells_to_points,
     connected_components,
@@ -128,10 +129,11 @@ def commands_of(config: EnvConfig) -> NDArray[np.float32]:
 def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
     """Refuse maps that would take minutes and gigabytes to prepare."""
     name, (height, width) = occupancy_map.name, occupancy_map.shape
-    if height * width > MAX_CELLS:
+    most = MAX_CELLS_TOGETHER if occupancy_map.parts else MAX_CELLS
+    if height * width > most:
         instead = "fewer maps" if occupancy_map.parts else "coarser ones"
         raise ValueError(
-            f"map {name}: {width} x {height} cells, expected at most {MAX_CELLS:,}: {instead}"
+            f"map {name}: {width} x {height} cells, expected at most {most:,}: {instead}"
         )
     width_m, height_m = occupancy_map.tile_m
     points = (width_m + 1) * (height_m + 1) / config.coverage_cell**2

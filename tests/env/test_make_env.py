@@ -136,8 +136,11 @@ def test_a_robot_that_starts_on_the_border_of_a_cell_can_move() -> None:
     assert pose[0] < 0.2
 
 
-def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
+def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Before anything of that size is allocated."""
+    monkeypatch.setattr(prepare, "MAX_CELLS_TOGETHER", 17_000_000)
     occupied = np.zeros((40, 40), dtype=bool)
     points = np.array([[0.3, 0.3], [0.7, 0.7]])
     room = OccupancyMap("room", close_border(occupied), 0.05, 2 * points, 2 * points)
@@ -154,7 +157,7 @@ def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
         (wide, r"4,000 x 4,000 m with env\.coverage_cell 0\.325 m are 151,"),
         (many, r"24000 spawn points with spawn_radius 1e\+06 m are 38,400,000 places"),
         (vast, r"4200 x 4200 cells, expected at most 16,777,216: coarser ones"),
-        (several, r"4200 x 4200 cells, expected at most 16,777,216: fewer maps"),
+        (several, r"4200 x 4200 cells, expected at most 17,000,000: fewer maps"),
     ):
         with pytest.raises(ValueError, match=fault):
             make_env(large)
