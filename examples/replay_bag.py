@@ -65,7 +65,7 @@ def read_events(bag: Path, topics: dict[str, str]) -> Iterator[Event]:
     Raises:
         ValueError: the bag cannot be read, lacks a topic, or has another type there.
     """
-    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     kinds = {topic: kind for kind, topic in topics.items()}
@@ -83,7 +83,7 @@ def read_events(bag: Path, topics: dict[str, str]) -> Iterator[Event]:
                     what = f"is of {found[topic]}" if topic in found else "is not in the bag"
                     raise ValueError(
                         f"{bag}: topic {topic} {what}, expected {' or '.join(expected[kind])} "
-                        f"(--{kind}); it has {', '.join(sorted(found))}"
+                        f"(--{kind}); it has {', '.join(sorted(found)) or 'none'}"
                     )
             chosen = [one for one in reader.connections if one.topic in kinds]
             first = reader.start_time
@@ -95,8 +95,11 @@ def read_events(bag: Path, topics: dict[str, str]) -> Iterator[Event]:
                 frame = message.header.frame_id
                 time = (nanoseconds - first) * 1e-9
                 yield Event(time, kinds[connection.topic], frame, value)
-    except (AnyReaderError, OSError) as error:
-        raise ValueError(f"{bag}: cannot be read as a bag ({error})") from None
+    except ValueError:
+        raise
+    except Exception as error:  # Its readers raise many kinds on damaged files.
+        what = " ".join(str(error).split())
+        raise ValueError(f"{bag}: cannot be read as a bag ({what})") from None
 
 
 def replay(events: Iterator[Event], controller: Controller, mount: Mount) -> list[Row]:

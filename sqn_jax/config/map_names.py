@@ -173,6 +173,14 @@ class MapSet:
         )
         return MapSet(names, self.weights)
 
+    def without_folders(self) -> MapSet:
+        """The same with the names alone for files; as it is where two of them would be the same."""
+        names = tuple(
+            MapFile(Path(name.path).name, name.resolution) if isinstance(name, MapFile) else name
+            for name in self.names
+        )
+        return MapSet(names, self.weights) if len(set(names)) == len(names) else self
+
     def _parts(self, *, stems: bool = False) -> Iterator[str]:
         runs: list[tuple[MapName, MapName, int]] = []  # First, last, weight.
         for name, weight in zip(self.names, self.weights, strict=True):

@@ -78,6 +78,11 @@ def check_export(folder: Path) -> list[Agreement]:
             "export of this version"
         )
     _require_params(folder, contents[PARAMS], config)
+    if hashlib.sha256(contents[PARAMS]).hexdigest() != description["params_sha256"]:
+        raise ValueError(
+            f"{named(folder / PARAMS)}: is of another policy: its digest is not params_sha256 "
+            f"({CONFIG})"
+        )
     _require_graph(folder / ONNX, contents[ONNX], onnx_description(description))
     reference = _reference(folder, contents[REFERENCE], config)
     numpy_policy = sqn_policy.Policy(folder / PARAMS)
@@ -122,7 +127,7 @@ def _described(folder: Path, data: bytes) -> tuple[TrainConfig, dict[str, Any]]:
     except ValueError as error:
         raise ValueError(f"{named(path)}: {one_line(error)}") from None
     if difference:
-        raise ValueError(f"{named(path)}: robot.{difference} by its own settings")
+        raise ValueError(f"{named(path)}: robot: {difference} by its own settings")
     return config, description
 
 
@@ -223,6 +228,13 @@ def compare(runtime: str, step: Step, reference: Mapping[str, NDArray[Any]]) -> 
             raise ValueError(
                 f"{runtime}: the Q-values of step {index} are {np.round(q_values, 4).tolist()}, "
                 f"expected {np.round(expected, 4).tolist()} ({REFERENCE})"
+            )
+        chosen = int(reference["actions"][index])
+        possible = 0 <= chosen < expected.size
+        if not possible or expected.max() - expected[chosen] > 2 * TOLERANCE * scale:
+            raise ValueError(
+                f"{named(Path(REFERENCE))}: action {chosen} of step {index} has not the largest of "
+                f"the Q-values {np.round(expected, 4).tolist()}"
             )
         differences.append(float(np.abs(q_values - expected).max() / max(scale, 1e-30)))
         ties += int(q_values.argmax() != reference["actions"][index])

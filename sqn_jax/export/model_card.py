@@ -125,7 +125,7 @@ def _introduction(config: TrainConfig) -> str:
     agent, rate = config.algo.upper(), 1 / config.env.time_step
     return f"""A policy of sqn_jax (agent {agent}) for mapless navigation: from the ranges around a
 robot and the distance and direction of its goal to one of five commands, {rate:g} times a second.
-Trained in simulation on `{config.map}`.
+Trained in simulation on `{config.maps.without_folders()}`.
 
 **Not safety rated.** The network has no guarantee of any kind. Put a bumper, an emergency stop or a
 certified scanner between it and the motors, and people out of reach of both."""

@@ -98,7 +98,9 @@ def policy_graph(
     skill_weights, q_values = _heads(graph, config.algo, network, perception)
     graph.node("Identity", skill_weights, output="skill_weights")
     graph.node("Identity", q_values, output="q_values")
-    graph.node("Reshape", carry, graph.constant([1, 1, size], np.int64), output="h_out")
+    after = graph.node("Reshape", carry, graph.constant([1, 1, size], np.int64))
+    # A goal that is unknown for once must not erase what the policy has seen.
+    graph.node("Where", graph.node("IsNaN", after), "h_in", after, output="h_out")
     graph.node("ArgMax", "q_values", output="action_index", axis=1, keepdims=0)
     commands = graph.constant(commands_of(env))
     graph.node("Gather", commands, "action_index", output="actions", axis=0)

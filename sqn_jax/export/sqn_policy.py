@@ -4,7 +4,7 @@ policy = Policy("params.safetensors")  # config.json beside it; or NAME.npz and 
 command, hidden = policy.act(ranges, distance, heading, hidden)  # [v m/s, w rad/s] for time_step s
 
 Ranges: m along `policy.beam_angles` (rad, left is positive), inf or NaN where nothing is hit.
-Goal: m and rad; where it is NaN the robot stands still. Hidden: None at each new goal.
+Goal: m and rad; where it is NaN the robot waits, and hidden stays. None at each new goal.
 """
 
 import json
@@ -38,8 +38,8 @@ class Policy:
 
     def act(self, ranges, distance, heading, hidden=None):
         hidden = np.zeros(self.config["network"]["hidden_size"]) if hidden is None else hidden
-        q_values, _, hidden = self.step(np.append(ranges, [distance, heading]), hidden)
-        return self.commands[q_values.argmax()], hidden
+        q_values, _, after = self.step(np.append(ranges, [distance, heading]), hidden)
+        return self.commands[q_values.argmax()], hidden if np.isnan(q_values[0]) else after
 
     def step(self, obs, hidden):  # obs [R + 2] -> Q-values [5], skill weights [K], hidden [H]
         ranges, goal = self.inputs(np.asarray(obs, "f4"), self.env["max_range"])

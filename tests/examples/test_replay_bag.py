@@ -175,3 +175,20 @@ def test_a_file_that_is_no_bag_is_refused(
         bag = tmp_path / name
         assert replay_bag.main([str(bag), "--policy", "x", "--out", str(tmp_path / "out")]) == 2
         assert "cannot be read as a bag" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_a_damaged_bag_is_refused_in_a_line(tmp_path: Path, plugin: StoragePlugin) -> None:
+    folder = write_bag(tmp_path, plugin)
+    (path,) = (file for file in folder.iterdir() if file.suffix != ".yaml")
+    whole = path.read_bytes()
+    topics = {"scan": "/scan", "goal": "/goal_pose", "pose": "/odom"}
+    messages = []
+    for begin in range(0, len(whole), len(whole) // 12):
+        path.write_bytes(whole[:begin] + b"\xff" * 40 + whole[begin + 40 :])
+        try:
+            list(replay_bag.read_events(folder, topics))
+        except ValueError as error:
+            messages.append(str(error))
+    assert messages
+    assert all(len(message.splitlines()) == 1 for message in messages)

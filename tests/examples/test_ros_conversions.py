@@ -131,6 +131,31 @@ def test_a_scan_without_returns_is_no_open_space(reading: float) -> None:
         scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=FAR)
 
 
+@pytest.mark.parametrize(
+    ("angles", "mount", "reason"),
+    [
+        ((0.0, 0.0), Mount(), "all 9 beams of the scan point the same way"),
+        ((math.nan, 0.1), Mount(), "not finite"),
+        ((0.0, math.inf), Mount(), "not finite"),
+        ((0.0, 0.1), Mount(yaw=math.nan), "not finite"),
+        ((0.0, 0.1), Mount(x=math.nan), "not finite"),
+    ],
+)
+def test_beams_that_point_nowhere_are_no_open_space(
+    angles: tuple[float, float], mount: Mount, reason: str
+) -> None:
+    scan = Scan(np.full(9, 1.0), *angles, 0.1, 12.0)
+    with pytest.raises(ValueError, match=reason):
+        scan_to_sectors(scan, SECTORS, FAR, mount=mount, unseen=FAR)
+
+
+@pytest.mark.parametrize(("reading", "limit"), [(math.inf, math.inf), (1.0, 0.0), (1.0, math.nan)])
+def test_a_limit_makes_nothing_a_return(reading: float, limit: float) -> None:
+    scan = Scan(np.full(360, reading), 0.0, math.radians(1), 0.1, limit)
+    with pytest.raises(ValueError, match="none of the 360 beams"):
+        scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=FAR)
+
+
 @given(st.integers(12, 800), st.integers(0, 359), st.booleans(), st.integers(0, 799))
 def test_no_return_in_view_is_lost(count: int, first: int, clockwise: bool, index: int) -> None:
     step = (-1 if clockwise else 1) * 360 / count

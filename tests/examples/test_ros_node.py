@@ -96,6 +96,7 @@ def lost() -> tuple[float, float, float]:
         (lambda c: None, lambda: (math.nan, 0, 0), 0.0, "the goal or the pose is not finite"),
         (lambda c: c.set_goal((math.nan, 0)), here, 0.0, "the goal or the pose is not finite"),
         (lambda c: c.set_scan(scan(), Mount(), math.nan), here, 0.0, "the scan is old"),
+        (lambda c: None, here, -9.0, "the scan is from the future: the clock went back"),
         (lambda c: c.set_goal(None), here, 0.0, "there is no goal"),
         (lambda c: c.set_goal((0.2, 0.2)), here, 0.0, "the goal is reached"),
         (
@@ -112,6 +113,15 @@ def test_it_stops_and_says_why(
     controller, _ = driving()
     change(controller)
     assert controller.tick(pose, now) == Command(0.0, 0.0, reason)
+
+
+def test_a_clock_that_went_back_holds_no_command() -> None:
+    controller, policy = driving()
+    controller.set_scan(scan(), Mount(), 100.0)
+    assert controller.tick(here, 100.0) == Command(0.5, 0.0)
+    controller.set_scan(scan(ahead=0.5), Mount(), 3.0)
+    assert controller.tick(here, 3.0) == Command(0.0, pytest.approx(math.pi / 5))
+    assert len(policy.seen) == 2
 
 
 def test_a_policy_that_is_not_finite_stops_the_robot_and_a_later_scan_starts_it() -> None:
@@ -203,9 +213,14 @@ class Buffer:
         self.known: dict[tuple[str, str], Any] = {}
 
     def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        assert target != source
         if (target, source) not in self.known:
             raise TransformException(f"{target} {source} at {time}")
         return self.known[target, source]
+
+    def clear(self) -> None:
+        """As in tf2, what is fixed stays."""
+        del self.known["map", "base_link"]
 
 
 def transform(x: float, y: float, yaw: float, stamp: float = 0.0) -> Any:
@@ -358,6 +373,41 @@ def test_a_stamp_from_the_future_does_not_hide_a_silent_sensor(ros: Any) -> None
     assert node.lines == ["the robot stands: the scan is old"]
 
 
+def test_simulated_time_that_begins_anew_stops_the_robot(ros: Any) -> None:
+    node = started(ros)
+    node.clock.time = 100.0
+    node._transforms.known["map", "base_link"] = transform(1.0, 1.0, 0.0, 100.0)
+    node.on_scan(message(100.0))
+    node.on_goal(goal("map", 1.0, 4.0))
+    node.on_timer()
+    node.clock.time = 1.0
+    node.on_timer()
+    node.on_scan(message(1.0))
+    node.on_timer()
+    node._transforms.known["map", "base_link"] = transform(1.0, 1.0, 0.0, 1.0)
+    node.on_timer()
+    assert commands(node) == [(0.5, 0.0), (0.0, 0.0), (0.0, 0.0), (0.5, 0.0)]
+    assert [line.split(" stands: ")[1] for line in node.lines] == [
+        "the scan is from the future: the clock went back",
+        "the goal is in the frame 'map', in which TF does not know base_link",
+    ]
+
+
+def test_a_goal_that_moves_along_is_refused(ros: Any) -> None:
+    node = started(ros)
+    node.on_scan(message(0.0))
+    node.on_goal(goal("base_link", 1.0, 4.0))
+    node.on_timer()
+    assert commands(node) == [(0.0, 0.0)]
+    assert node.lines[-1].endswith("the frame 'base_link', which moves with the robot")
+
+
+@pytest.mark.parametrize("rate", [0.0, 2.0, math.nan, math.inf])
+def test_a_rate_at_which_what_is_old_goes_unnoticed_is_refused(ros: Any, rate: float) -> None:
+    with pytest.raises(ValueError, match="rate is"):
+        started(ros, rate=rate)
+
+
 def test_a_scan_of_an_unknown_frame_is_not_used(ros: Any) -> None:
     node = started(ros)
     del node._transforms.known["base_link", "laser"]
@@ -382,7 +432,7 @@ def test_the_last_message_is_a_stop(ros: Any, end: type[BaseException]) -> None:
     ros.rclpy.spin = spin
     ros.rclpy.shutdown = lambda: order.append((commands(order[1]), order[1].destroyed))
     ros.signal = SimpleNamespace(
-        signal=lambda *_: None, SIGTERM=15, default_int_handler=None
+        signal=lambda *_: None, SIGTERM=15, SIGHUP=1, default_int_handler=None
     )  # The process's own stays.
     if end is KeyboardInterrupt:
         ros.main()
@@ -397,7 +447,9 @@ def test_what_cannot_be_loaded_is_a_line(ros: Any, capsys: pytest.CaptureFixture
     FakeNode.overrides = {"slowdown": -1.0}
     ros.rclpy.init = lambda **_: None
     ros.rclpy.shutdown = lambda: None
-    ros.signal = SimpleNamespace(signal=lambda *_: None, SIGTERM=15, default_int_handler=None)
+    ros.signal = SimpleNamespace(
+        signal=lambda *_: None, SIGTERM=15, SIGHUP=1, default_int_handler=None
+    )
     with pytest.raises(SystemExit) as stop:
         ros.main()
     assert stop.value.code == 2

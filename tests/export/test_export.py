@@ -24,7 +24,7 @@ from rooms import write_empty_room
 from sqn_jax import load_policy
 from sqn_jax.agent.networks import initial_carry
 from sqn_jax.cli import main
-from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig, to_public_dict
 from sqn_jax.env import Observation
 from sqn_jax.export import folder as folders
 from sqn_jax.export import sqn_policy
@@ -132,8 +132,12 @@ def test_onnx_and_numpy_say_what_the_network_says(config: TrainConfig, tmp_path:
         np.testing.assert_allclose(command, commands[expected[step].argmax()], rtol=1e-6)
         assert config.algo == "dqn" or hidden.dtype == np.float32  # Without memory: zeros.
     obs[-1] = np.nan
-    assert session.run(["actions"], {"obs": obs[None], "h_in": h_in})[0].tolist() == [[0, 0]]
-    assert by_numpy.act(ranges[0], np.nan, 0.0)[0].tolist() == [0, 0]
+    found, after = session.run(["actions", "h_out"], {"obs": obs[None], "h_in": h_in})
+    assert found.tolist() == [[0, 0]]
+    np.testing.assert_array_equal(after, h_in)
+    command, kept = by_numpy.act(ranges[0], np.nan, 0.0, hidden)
+    assert command.tolist() == [0, 0]
+    np.testing.assert_array_equal(kept, hidden)  # A gap in the localization is no end.
     assert by_numpy.beam_angles.tolist() == describe_robot(config)["beam_angles_rad"]
 
 
@@ -243,6 +247,18 @@ def no_graph(folder: Path) -> None:
     (folder / "policy.onnx").write_bytes(b"\x0a" * 100)
 
 
+def other_params(folder: Path) -> None:
+    data = bytearray((folder / "params.safetensors").read_bytes())
+    data[-4] ^= 1  # So little that no Q-value tells.
+    (folder / "params.safetensors").write_bytes(data)
+
+
+def other_actions(folder: Path) -> None:
+    arrays = dict(np.load(folder / "reference.npz"))
+    actions = arrays["q_values"].argmin(axis=1)
+    np.savez(folder / "reference.npz", **(arrays | {"actions": actions}))
+
+
 def short_rollout(folder: Path) -> None:
     arrays = dict(np.load(folder / "reference.npz"))
     np.savez(folder / "reference.npz", **(arrays | {"actions": arrays["actions"][:-1]}))
@@ -253,11 +269,13 @@ def short_rollout(folder: Path) -> None:
     [
         (other_robot, "policy.onnx: is of another robot or policy: max_range_m is 5.0"),
         (other_weights, "ONNX Runtime: the Q-values of step 0 are"),
-        (other_speed, "config.json: robot.commands_m_s_rad_s is"),
+        (other_speed, "config.json: robot: commands_m_s_rad_s is"),
         (other_network, "params.safetensors: does not hold the"),
         (unknown_setting, "env.lidar_height is 1.0"),
         (code, "sqn_policy.py: is not that of this version"),
         (no_graph, "policy.onnx: no sound ONNX file"),
+        (other_params, "params.safetensors: is of another policy"),
+        (other_actions, "reference.npz: action "),
         (short_rollout, "reference.npz: expected observations, hidden"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -394,6 +412,10 @@ def test_the_card_says_what_robot_it_is_for_and_what_is_known() -> None:
     assert facts["model-index"][0]["results"][0]["metrics"][0]["value"] == 0.98
     for part in ("Not safety rated", "270 degrees", "up to 3 m", "90 degrees behind it", "2.0%"):
         assert part in body
+    config = dataclasses.replace(policy.config, map="/home/me/secret/hall.yaml*2,maze:0-1")
+    private = dataclasses.replace(policy, config=config)
+    assert "on `hall.yaml*2,maze:0-1`" in model_card(private, [])
+    assert to_public_dict(config)["map"] == "hall.yaml*2,maze:0-1"
     bare = yaml.safe_load(model_card(policy, []).split("---\n", 2)[1])
     assert not {"license", "model-index"} & bare.keys()
 

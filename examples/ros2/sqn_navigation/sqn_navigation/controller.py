@@ -99,7 +99,7 @@ class Controller:
         self._mount = Mount()
         self._scan_time = -math.inf
         self._hidden: Any = None
-        self._next_decision = -math.inf
+        self._decided = -math.inf
         self._command = Command()
 
     @property
@@ -110,7 +110,7 @@ class Controller:
     def set_goal(self, goal: tuple[float, float] | None) -> None:
         """A new goal [x, y] m, or none: the policy forgets what it saw on the way to the last."""
         self._goal, self._hidden = goal, None
-        self._next_decision, self._command = -math.inf, Command()
+        self._decided, self._command = -math.inf, Command()
 
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
@@ -126,7 +126,7 @@ class Controller:
         try:
             return self._drive(pose, now)
         except ValueError as error:  # What is odd is a reason to stop, and no reason to end.
-            self._next_decision = -math.inf
+            self._decided = -math.inf
             return Command(reason=str(error))
 
     def _drive(self, pose: Callable[[], Pose], now: float) -> Command:
@@ -135,15 +135,17 @@ class Controller:
         age = now - self._scan_time
         if self._scan is None or not age <= self.limits.stale_after:
             raise ValueError("there is no scan" if self._scan is None else "the scan is old")
+        if age < -self.limits.stale_after:  # Simulated time or a bag began anew.
+            raise ValueError("the scan is from the future: the clock went back")
         distance, heading = goal_in_robot_frame(pose(), self._goal)
         if not math.isfinite(distance + heading):
             raise ValueError("the goal or the pose is not finite")
         if distance < self.limits.goal_radius:
             self.set_goal(None)
             return Command(reason="the goal is reached")
-        if now >= self._next_decision:
+        if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
             self._command = self._decide(self._scan, distance, heading)
-            self._next_decision = now + self.policy.time_step * self.limits.slowdown
+            self._decided = now
         return self._command
 
     def _decide(self, scan: Scan, distance: float, heading: float) -> Command:

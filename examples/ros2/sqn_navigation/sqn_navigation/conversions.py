@@ -62,13 +62,20 @@ def scan_to_sectors(
         [R] ranges from the center of the robot, m.
 
     Raises:
-        ValueError: no beam returned anything: the sensor is covered, blind or off.
+        ValueError: no beam returned anything: the sensor is covered, blind or off; or where its
+            beams point is unknown, so that all would read as not covered.
     """
     readings = np.asarray(scan.ranges, np.float64)
     readings = np.where(np.isneginf(readings), scan.range_min, readings)
+    places = (scan.angle_min, scan.angle_increment, mount.x, mount.y, mount.yaw)
+    if not all(map(math.isfinite, places)):
+        raise ValueError("the angles of the scan or the place of its sensor are not finite")
+    if scan.angle_increment == 0 and len(readings) > 1:
+        raise ValueError(f"all {len(readings)} beams of the scan point the same way")
     directions = scan.angle_min + scan.angle_increment * np.arange(len(readings))
     directions = mount.yaw + (-directions if mount.upside_down else directions)
-    hit = (readings >= scan.range_min) & (readings <= scan.range_max)  # NaN is neither.
+    # NaN is neither; an infinite `range_max` makes no infinite reading a return.
+    hit = (readings >= scan.range_min) & (readings <= scan.range_max) & np.isfinite(readings)
     if not hit.any():
         raise ValueError(f"none of the {len(readings)} beams of the scan returned anything")
     half = max(abs(scan.angle_increment), abs(beam_angles[1] - beam_angles[0])) / 2

@@ -51,12 +51,18 @@ class Navigator(Node):
         }
         names = ("max_speed", "max_turn_rate", "slowdown", "goal_radius", "stale_after", "unseen")
         limits = Limits(**{name: values[name] for name in names})
+        if not 1 <= values["rate"] * limits.stale_after < math.inf:
+            raise ValueError(
+                f"rate is {values['rate']}, expected at least one command in stale_after, "
+                f"{limits.stale_after} s"
+            )
         self._controller = Controller(load_policy(Path(values["policy"])), limits)
         self._base_frame = values["base_frame"]
         self._stamped = values["stamped"]
         self._goal_frame = ""
         self._mounts: dict[str, Mount] = {}
         self._last = Command(reason="waiting")
+        self._time = -math.inf
         self._transforms = Buffer()
         self._listener = TransformListener(self._transforms, self)
         self._publisher = self.create_publisher(
@@ -97,7 +103,11 @@ class Navigator(Node):
 
     def on_timer(self) -> None:
         """Publish a command; while there is no goal, the stop only once. Say each reason once."""
-        command = self._controller.tick(self._pose, self._now())
+        now = self._now()
+        if now < self._time - self._controller.limits.stale_after:
+            self._transforms.clear()  # Simulated time began anew: TF ignores what comes as old.
+        self._time = now
+        command = self._controller.tick(self._pose, now)
         if command.reason != self._last.reason and command.reason:
             self.get_logger().warning(f"the robot stands: {command.reason}")
         if self._controller.has_goal or command != self._last:
@@ -122,6 +132,10 @@ class Navigator(Node):
 
     def _pose(self) -> Pose:
         """The pose in the frame of the goal; raises ValueError where TF does not know it."""
+        if self._goal_frame == self._base_frame:
+            raise ValueError(
+                f"the goal is in the frame {self._goal_frame!r}, which moves with the robot"
+            )
         try:
             found = self._transforms.lookup_transform(self._goal_frame, self._base_frame, Time())
         except TransformException:
@@ -151,7 +165,8 @@ def main() -> None:
     """Run the node until it is stopped, and stop the robot then."""
     # The context must outlive the signal, or the last message would not leave.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for ending in (signal.SIGTERM, signal.SIGHUP):  # The latter where a remote login breaks off.
+        signal.signal(ending, signal.default_int_handler)
     try:
         node = Navigator()
     except ValueError as error:
