@@ -42,9 +42,18 @@ class Limits:
     """s without a scan or a pose after which the robot stops."""
     unseen: float = math.inf
     """m, reading of directions that the sensor does not cover."""
+    time_limit: float = 600.0
+    """s, a goal that is not reached by then is given up."""
 
     def __post_init__(self) -> None:
-        for name in ("max_speed", "max_turn_rate", "slowdown", "goal_radius", "stale_after"):
+        for name in (
+            "max_speed",
+            "max_turn_rate",
+            "slowdown",
+            "goal_radius",
+            "stale_after",
+            "time_limit",
+        ):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
@@ -100,6 +109,7 @@ class Controller:
         self._scan_time = -math.inf
         self._hidden: Any = None
         self._decided = -math.inf
+        self._began = math.inf
         self._command = Command()
 
     @property
@@ -110,7 +120,7 @@ class Controller:
     def set_goal(self, goal: tuple[float, float] | None) -> None:
         """A new goal [x, y] m, or none: the policy forgets what it saw on the way to the last."""
         self._goal, self._hidden = goal, None
-        self._decided, self._command = -math.inf, Command()
+        self._decided, self._began, self._command = -math.inf, math.inf, Command()
 
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
@@ -132,6 +142,10 @@ class Controller:
     def _drive(self, pose: Callable[[], Pose], now: float) -> Command:
         if self._goal is None:
             return Command(reason="there is no goal")
+        self._began = min(self._began, now)
+        if now - self._began > self.limits.time_limit:
+            self.set_goal(None)
+            return Command(reason=f"the goal is given up after {self.limits.time_limit:g} s")
         age = now - self._scan_time
         if self._scan is None or not age <= self.limits.stale_after:
             raise ValueError("there is no scan" if self._scan is None else "the scan is old")
