@@ -107,6 +107,7 @@ class Controller:
         self._scan: Scan | None = None
         self._mount = Mount()
         self._scan_time = -math.inf
+        self._ranges: Any = None
         self._hidden: Any = None
         self._decided = -math.inf
         self._began = math.inf
@@ -125,6 +126,7 @@ class Controller:
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
         self._scan, self._mount, self._scan_time = scan, mount, time
+        self._ranges = None
 
     def tick(self, pose: Callable[[], Pose], now: float) -> Command:
         """What the robot is to do at `now` s.
@@ -157,21 +159,25 @@ class Controller:
         if distance < self.limits.goal_radius:
             self.set_goal(None)
             return Command(reason="the goal is reached")
+        if self._ranges is None:  # A sensor that went blind stops a command that is held, too.
+            self._ranges = self._seen(self._scan)
         if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
-            self._command = self._decide(self._scan, distance, heading)
+            self._command = self._decide(distance, heading)
             self._decided = now
         return self._command
 
-    def _decide(self, scan: Scan, distance: float, heading: float) -> Command:
+    def _seen(self, scan: Scan) -> Any:
         max_range = self.policy.env["max_range"]
-        ranges = scan_to_sectors(
+        return scan_to_sectors(
             scan,
             self.policy.beam_angles,
             max_range,
             mount=self._mount,
             unseen=min(self.limits.unseen, max_range),
         )
-        velocity, self._hidden = self.policy.act(ranges, distance, heading, self._hidden)
+
+    def _decide(self, distance: float, heading: float) -> Command:
+        velocity, self._hidden = self.policy.act(self._ranges, distance, heading, self._hidden)
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))
