@@ -115,6 +115,27 @@ def test_it_stops_and_says_why(
     assert controller.tick(pose, now) == Command(0.0, 0.0, reason)
 
 
+def test_a_goal_that_is_not_reached_is_given_up() -> None:
+    controller, _ = driving(time_limit=20.0)
+    controller.set_scan(scan(), Mount(), 100.0)
+    assert controller.tick(here, 100.0) == Command(0.5, 0.0)
+    controller.set_scan(scan(), Mount(), 120.1)
+    assert controller.tick(here, 120.1).reason == "the goal is given up after 20 s"
+    assert controller.tick(here, 120.2).reason == "there is no goal"
+    controller.set_goal((0.0, 3.0))
+    assert controller.tick(here, 120.3) == Command(0.5, 0.0)
+
+
+def test_a_sensor_that_goes_blind_ends_a_command_that_is_held() -> None:
+    controller, _ = driving()
+    controller.tick(here, 0.0)
+    controller.set_scan(Scan(np.full(9, np.nan), 0, 0.1, 0.1, 5), Mount(), 0.1)
+    reason = "none of the 9 beams of the scan returned anything"
+    assert [controller.tick(here, now) for now in (0.1, 0.2)] == [Command(reason=reason)] * 2
+    controller.set_scan(scan(), Mount(), 0.25)
+    assert controller.tick(here, 0.25) == Command(0.5, 0.0)
+
+
 def test_a_clock_that_went_back_holds_no_command() -> None:
     controller, policy = driving()
     controller.set_scan(scan(), Mount(), 100.0)

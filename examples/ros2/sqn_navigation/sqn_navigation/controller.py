@@ -42,9 +42,18 @@ class Limits:
     """s without a scan or a pose after which the robot stops."""
     unseen: float = math.inf
     """m, reading of directions that the sensor does not cover."""
+    time_limit: float = 600.0
+    """s, a goal that is not reached by then is given up."""
 
     def __post_init__(self) -> None:
-        for name in ("max_speed", "max_turn_rate", "slowdown", "goal_radius", "stale_after"):
+        for name in (
+            "max_speed",
+            "max_turn_rate",
+            "slowdown",
+            "goal_radius",
+            "stale_after",
+            "time_limit",
+        ):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
@@ -98,8 +107,10 @@ class Controller:
         self._scan: Scan | None = None
         self._mount = Mount()
         self._scan_time = -math.inf
+        self._ranges: Any = None
         self._hidden: Any = None
         self._decided = -math.inf
+        self._began = math.inf
         self._command = Command()
 
     @property
@@ -110,11 +121,12 @@ class Controller:
     def set_goal(self, goal: tuple[float, float] | None) -> None:
         """A new goal [x, y] m, or none: the policy forgets what it saw on the way to the last."""
         self._goal, self._hidden = goal, None
-        self._decided, self._command = -math.inf, Command()
+        self._decided, self._began, self._command = -math.inf, math.inf, Command()
 
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
         self._scan, self._mount, self._scan_time = scan, mount, time
+        self._ranges = None
 
     def tick(self, pose: Callable[[], Pose], now: float) -> Command:
         """What the robot is to do at `now` s.
@@ -132,6 +144,10 @@ class Controller:
     def _drive(self, pose: Callable[[], Pose], now: float) -> Command:
         if self._goal is None:
             return Command(reason="there is no goal")
+        self._began = min(self._began, now)
+        if now - self._began > self.limits.time_limit:
+            self.set_goal(None)
+            return Command(reason=f"the goal is given up after {self.limits.time_limit:g} s")
         age = now - self._scan_time
         if self._scan is None or not age <= self.limits.stale_after:
             raise ValueError("there is no scan" if self._scan is None else "the scan is old")
@@ -143,21 +159,25 @@ class Controller:
         if distance < self.limits.goal_radius:
             self.set_goal(None)
             return Command(reason="the goal is reached")
+        if self._ranges is None:  # A sensor that went blind stops a command that is held, too.
+            self._ranges = self._seen(self._scan)
         if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
-            self._command = self._decide(self._scan, distance, heading)
+            self._command = self._decide(distance, heading)
             self._decided = now
         return self._command
 
-    def _decide(self, scan: Scan, distance: float, heading: float) -> Command:
+    def _seen(self, scan: Scan) -> Any:
         max_range = self.policy.env["max_range"]
-        ranges = scan_to_sectors(
+        return scan_to_sectors(
             scan,
             self.policy.beam_angles,
             max_range,
             mount=self._mount,
             unseen=min(self.limits.unseen, max_range),
         )
-        velocity, self._hidden = self.policy.act(ranges, distance, heading, self._hidden)
+
+    def _decide(self, distance: float, heading: float) -> Command:
+        velocity, self._hidden = self.policy.act(self._ranges, distance, heading, self._hidden)
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import signal
 import sys
@@ -36,6 +37,7 @@ PARAMETERS: dict[str, Any] = {
     "goal_radius": 0.3,
     "stale_after": 0.3,
     "unseen": math.inf,
+    "time_limit": 600.0,
 }
 """See config/sqn_navigation.yaml."""
 
@@ -49,7 +51,7 @@ class Navigator(Node):
             name: self.declare_parameter(name, default).value
             for name, default in PARAMETERS.items()
         }
-        names = ("max_speed", "max_turn_rate", "slowdown", "goal_radius", "stale_after", "unseen")
+        names = {limit.name for limit in dataclasses.fields(Limits)}
         limits = Limits(**{name: values[name] for name in names})
         if not 1 <= values["rate"] * limits.stale_after < math.inf:
             raise ValueError(
