@@ -149,6 +149,22 @@ def test_beams_that_point_nowhere_are_no_open_space(
         scan_to_sectors(scan, SECTORS, FAR, mount=mount, unseen=FAR)
 
 
+@pytest.mark.parametrize(
+    ("count", "increment"), [(1, 0.1), (2, 1e-12), (400, 1e-12), (80, math.radians(1))]
+)
+def test_a_scan_of_a_few_directions_is_no_open_space(count: int, increment: float) -> None:
+    scan = Scan(np.full(count, 1.0), 0.0, increment, 0.1, 12.0)
+    with pytest.raises(ValueError, match="of the 71 directions only"):
+        scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=FAR)
+
+
+def test_a_scan_of_a_quarter_of_the_directions_will_do() -> None:
+    scan = Scan(np.full(96, 1.0), math.radians(-48), math.radians(1), 0.1, 12.0)
+    # Every 5 degrees from -50 to 45: 50 degrees is 3 degrees from the last beam, more than a half.
+    sectors = scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=FAR)
+    np.testing.assert_allclose(np.sort(sectors), [1.0] * 20 + [FAR] * 51)
+
+
 @pytest.mark.parametrize(("reading", "limit"), [(math.inf, math.inf), (1.0, 0.0), (1.0, math.nan)])
 def test_a_limit_makes_nothing_a_return(reading: float, limit: float) -> None:
     scan = Scan(np.full(360, reading), 0.0, math.radians(1), 0.1, limit)

@@ -41,6 +41,10 @@ class Mount:
     """Its z axis points to the ground, which exchanges left and right."""
 
 
+LEAST_COVERED = 0.25
+"""Share of the policy's directions that a scan must cover: none drives with less than 90 degrees."""
+
+
 def scan_to_sectors(
     scan: Scan, beam_angles: Floats, max_range: float, *, mount: Mount, unseen: float
 ) -> Floats:
@@ -63,7 +67,7 @@ def scan_to_sectors(
 
     Raises:
         ValueError: no beam returned anything: the sensor is covered, blind or off; or where its
-            beams point is unknown, so that all would read as not covered.
+            beams point is unknown, or most directions are not covered and would read as `unseen`.
     """
     readings = np.asarray(scan.ranges, np.float64)
     readings = np.where(np.isneginf(readings), scan.range_min, readings)
@@ -80,6 +84,8 @@ def scan_to_sectors(
         raise ValueError(f"none of the {len(readings)} beams of the scan returned anything")
     half = max(abs(scan.angle_increment), abs(beam_angles[1] - beam_angles[0])) / 2
     covered = _within(directions, beam_angles, half).any(axis=0)
+    if covered.mean() < LEAST_COVERED:
+        raise ValueError(f"the scan covers {covered.sum()} of the {covered.size} directions only")
     x = mount.x + readings[hit] * np.cos(directions[hit])
     y = mount.y + readings[hit] * np.sin(directions[hit])
     inside = _within(np.arctan2(y, x), beam_angles, half)
