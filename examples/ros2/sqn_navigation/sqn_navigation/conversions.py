@@ -42,7 +42,7 @@ class Mount:
 
 
 LEAST_COVERED = 0.25
-"""Share of the policy's directions that a scan must cover: none drives with less than 90 degrees."""
+"""Share of the directions of a policy that a scan must cover: about 90 degrees."""
 
 
 def scan_to_sectors(
