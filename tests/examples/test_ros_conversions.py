@@ -92,7 +92,8 @@ def single(count: int = 360, **readings: float) -> np.ndarray:
     for degrees, reading in readings.items():
         ranges[int(degrees.removeprefix("at_")) % 360] = reading
     scan = Scan(ranges, 0.0, math.radians(1), 0.1, 12.0)
-    return scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=FAR)
+    # All of the circle is covered: nothing may read as unseen.
+    return scan_to_sectors(scan, SECTORS, FAR, mount=Mount(), unseen=0.5)
 
 
 def test_a_thin_post_is_seen_in_its_sector_alone() -> None:

@@ -343,6 +343,26 @@ def test_a_disk_that_fills_up_leaves_the_old_export(
     assert {path.read_bytes() for path in changed.iterdir()} == {b"new"}
 
 
+def test_a_move_that_fails_brings_the_old_export_back(
+    changed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in changed.iterdir()}
+    rename = Path.rename
+
+    def move(path: Path, target: Path) -> Path:
+        if path.name.endswith(".partial"):
+            raise OSError(5, "Input/output error", str(path))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", move)
+    monkeypatch.setattr(folders, "write_whole", lambda path, data: path.write_bytes(data))
+    monkeypatch.setattr(folders, "export_contents", lambda *_: dict.fromkeys(before, b"new"))
+    with pytest.raises(OSError, match="cannot be written"):
+        folders.export_policy(random_policy(tiny()), changed)
+    assert {path.name: path.read_bytes() for path in changed.iterdir()} == before
+    assert [path.name for path in changed.parent.iterdir()] == ["robot"]
+
+
 def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> None:
     for group, known in KNOWN_SETTINGS.items():
         assert {field.name for field in dataclasses.fields(group)} == known
