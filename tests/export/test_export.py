@@ -19,6 +19,7 @@ import pytest
 import yaml
 from compiling import compiling_quickly
 from flax import traverse_util
+from refusals import refusal
 from rooms import write_empty_room
 
 from sqn_jax import load_policy
@@ -59,14 +60,6 @@ def random_policy(config: TrainConfig, seed: int = 0) -> Policy:
         return jnp.asarray(rng.normal(size=leaf.shape), jnp.float32)
 
     return Policy("tiny", config, (jax.tree.map(draw, params_shapes(config)),))
-
-
-def refusal(call: Callable[[], Any]) -> str:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
-        call()
-    message = str(caught.value)
-    assert message.isprintable()
-    return message
 
 
 CONFIGS = {
