@@ -91,7 +91,7 @@ def window_programs(config: TrainConfig, params: EnvParams) -> dict[str, Timed]:
     """The two halves of a window of recurrent PQN: roll it out, learn from it."""
     program = loop.make_program(params, config)
     network = program.network
-    learner = loop.start_run(params, program).learner
+    learner = loop.start_run(program).learner
     key = jax.random.key(1)
     keys = jax.random.split(key, config.num_envs)
     actors = jax.jit(lambda keys, params: start_actors(keys, params, network))(keys, params)

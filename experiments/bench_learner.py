@@ -72,8 +72,8 @@ def make_problem(config: TrainConfig, env_params: EnvParams, num_updates: int) -
     settings = dataclasses.replace(config.replay, capacity=capacity, min_episodes=batch_size)
     config = dataclasses.replace(config, method="r2d2", num_envs=batch_size, replay=settings)
     program = loop.make_program(env_params, config)
-    learner = loop.start_run(env_params, program).learner
-    shapes = trajectory_shapes(env_params, program)
+    learner = loop.start_run(program).learner
+    shapes = trajectory_shapes(program)
     rng = np.random.default_rng(config.seed)
     memory = learner.memory
     for _ in range(STORED_BATCHES):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -28,11 +29,11 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
 
     Returns:
         Steps and updates a second (of all seeds), slowest and fastest steps a second, seconds to
-        compile and of the first call.
+        compile, of the first call, and of a whole run at this speed.
     """
     mesh = devices.choose(config)
     program = loop.make_program(env_params, config, mesh)
-    runner = loop.start_run(env_params, program)
+    runner = loop.start_run(program)
     compiled, compile_seconds = loop.compile_chunk(env_params, program)
     env_params = devices.place(env_params, mesh)
     warm_up = 0.0
@@ -56,11 +57,13 @@ def measure(config: TrainConfig, env_params: EnvParams, repeats: int) -> dict[st
         "method": config.method,
         "map": config.map,
         "num_envs": config.num_envs,
+        "num_seeds": config.num_seeds,
         "num_devices": 1 if mesh is None else mesh.size,
         "steps_per_chunk": steps,
         **timing.rates(steps, unit="steps_per_second"),
         "updates_per_second": four_digits(updates_a_chunk / timing.median),
         "compile_seconds": round(compile_seconds, 2),
+        "run_seconds": four_digits(config.num_chunks * timing.median),
     }
 
 
@@ -70,14 +73,14 @@ def memory(config: TrainConfig, env_params: EnvParams) -> dict[str, int]:
     `replay_bytes` is the replay (0 without one), `run_bytes` adds the episodes of one round.
     """
     program = loop.make_program(env_params, config)
-    item = r2d2.packed_item(trajectory_shapes(env_params, program))
+    item = r2d2.packed_item(trajectory_shapes(program))
     has_replay = config.method == "r2d2"
     capacity = config.replay.capacity if has_replay else 0
     return {
         "peak_process_bytes": peak_bytes(),
         "replay_episodes": capacity,
         "replay_bytes": replay.num_bytes(item, capacity) if has_replay else 0,
-        "run_bytes": memory_bytes(env_params, program),
+        "run_bytes": memory_bytes(program),
     }
 
 
@@ -87,12 +90,13 @@ def peak_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # Elsewhere it counts KiB.
 
 
-def table(entries: dict[str, dict[str, Any]]) -> str:
-    """One row a preset."""
+def table(entries: Sequence[dict[str, Any]]) -> str:
+    """One row for each preset and number of seeds."""
     rows = []
-    for preset, entry in entries.items():
-        row = [preset, entry["algo"], entry["method"], str(entry["num_envs"])]
+    for entry in entries:
+        row = [entry["preset"], entry["algo"], entry["method"]]
+        row += [str(entry["num_envs"]), str(entry["num_seeds"])]
         row += [f"{entry['steps_per_second']:,}", f"{entry['updates_per_second']:.3g}"]
-        rows.append([*row, f"{entry['compile_seconds']:.1f}"])
-    header = ["preset", "agent", "method", "robots", "steps a second", "updates a second"]
-    return markdown_table([*header, "seconds to compile"], rows)
+        rows.append([*row, f"{entry['compile_seconds']:.1f}", f"{entry['run_seconds']:.0f}"])
+    header = ["preset", "agent", "method", "robots", "seeds", "steps a second", "updates a second"]
+    return markdown_table([*header, "seconds to compile", "seconds a run"], rows)

@@ -13,7 +13,9 @@ PyTorch.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.metadata
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -61,11 +63,12 @@ def learner(options: argparse.Namespace) -> dict[str, Any]:
 
 def training(options: argparse.Namespace) -> dict[str, Any]:
     """Measure and print the part of whole training programs."""
-    entries = {}
-    for preset in options.presets:
-        config = PRESETS[preset]
+    entries = []
+    for preset, num_seeds in itertools.product(options.presets, options.num_seeds):
+        config = dataclasses.replace(PRESETS[preset], num_seeds=num_seeds)
         env_params = make_env(config.map, config.env)
-        entries[preset] = bench_train.measure(config, env_params, options.repeats)
+        measured = bench_train.measure(config, env_params, options.repeats)
+        entries.append({"preset": preset, **measured})
     print(bench_train.table(entries), end="\n\n")
     return {"train": entries}
 
@@ -128,14 +131,16 @@ def parse() -> argparse.Namespace:
     cores = sorted({1, os.cpu_count() or 1})
     parser.add_argument("--torch-threads", nargs="+", type=int, default=cores)
     parser.add_argument("--presets", nargs="+", choices=list(PRESETS), default=["quick"])
+    parser.add_argument("--num-seeds", nargs="+", type=int, default=[1], help="of the presets")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
     for name in ("steps", "repeats"):
         if getattr(options, name) < 1:
             raise ValueError(f"--{name} is {getattr(options, name)}, expected at least 1")
-    for name, values in (("envs", options.envs), ("torch-threads", options.torch_threads)):
-        if min(values) < 1:
-            raise ValueError(f"--{name} holds {min(values)}, expected at least 1")
+    for name in ("envs", "torch_threads", "num_seeds"):
+        least = min(getattr(options, name))
+        if least < 1:
+            raise ValueError(f"--{name.replace('_', '-')} holds {least}, expected at least 1")
     return options
 
 

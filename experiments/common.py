@@ -32,7 +32,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options that every experiment has."""
     parser.add_argument("--preset", choices=list(PRESETS), default="quick")
     parser.add_argument("--algos", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
-    parser.add_argument("--num-seeds", type=int, default=1, help="training seeds (default 1)")
+    parser.add_argument(
+        "--num-seeds", type=int, default=1, help="training seeds in one run (default 1)"
+    )
     parser.add_argument("--total-episodes", type=int, help="instead of the preset's")
     parser.add_argument(
         "--episodes", type=int, help="under each evaluation seed (default 100, smoke 20)"
@@ -69,27 +71,38 @@ def prepare(options: argparse.Namespace, settings: Settings) -> tuple[list[Path]
 
 
 def train_missing(options: argparse.Namespace) -> list[Path]:
-    """Train every agent and seed of which there is no finished run; returns all run folders.
+    """Train every agent of which there is no finished run; returns all run folders.
 
-    Seeds are trained one after the other: a run that was stopped is gone on with, and a seed added
-    later does not train the others again.
+    The seeds of an agent are trained side by side in one run. A run that was stopped is resumed;
+    with another number of seeds it is another run.
 
     Raises:
         ValueError: a folder holds a run with other settings.
     """
+    folders = []
+    for config in configs_of(options):
+        name = f"{config.algo}_seed{config.seed}"
+        if config.num_seeds > 1:
+            name = f"{config.algo}_seeds{config.seed}to{config.seed + config.num_seeds - 1}"
+        folder = runs_folder(options) / name
+        _train(config, folder)
+        folders.append(folder)
+    return folders
+
+
+def configs_of(options: argparse.Namespace) -> list[TrainConfig]:
+    """The settings of the run of each agent, with all its seeds.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
     if options.num_seeds < 1:
         raise ValueError(f"--num-seeds is {options.num_seeds}, expected at least 1")
-    folders = []
-    for algo in options.algos:
-        for seed in range(options.num_seeds):
-            changes: dict[str, Any] = {"algo": algo, "seed": seed}
-            if options.total_episodes is not None:
-                changes["total_episodes"] = options.total_episodes
-            config = dataclasses.replace(PRESETS[options.preset], **changes)
-            folder = runs_folder(options) / f"{algo}_seed{seed}"
-            _train(config, folder)
-            folders.append(folder)
-    return folders
+    changes: dict[str, Any] = {"num_seeds": options.num_seeds}
+    if options.total_episodes is not None:
+        changes["total_episodes"] = options.total_episodes
+    preset = PRESETS[options.preset]
+    return [dataclasses.replace(preset, algo=algo, **changes) for algo in options.algos]
 
 
 def _train(config: TrainConfig, folder: Path) -> None:

@@ -1,7 +1,7 @@
 """Write the tables of the pages from the records: python experiments/readme_tables.py [--check]
 
-Each table stands between `<!-- table NAME -->` and `<!-- end -->` in README.md, docs/RESULTS.md or
-docs/LAB_NOTES.md; what is between is replaced. With `--check` nothing is written: the exit code is
+Each table stands between `<!-- table NAME -->` and `<!-- end -->` in README.md or a page of
+docs/; what is between is replaced. With `--check` nothing is written: the exit code is
 1 if a table is not what the records say.
 
 ± is the sample standard deviation (n - 1). Records without `std_ddof` hold the population figure,
@@ -16,19 +16,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import recorded, run
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.statistics import sample_std
+from sqn_jax.evaluation.suite_scores import worst_tenth
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/RESULTS.md", "docs/LAB_NOTES.md")
+PAGES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT")),
+)
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
 """Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
 RADIUS = 0.3
+BENCHMARK = "benchmark.json"
+STARTS = ("start_smoke.json", "start_evaluate.json", "start_render.json")
 
 Entry = dict[str, Any]
 
@@ -113,23 +120,94 @@ def quick() -> str:
 
 
 def external() -> str:
-    """Policies and baselines on suites from elsewhere: success, and the worst tenth of the maps."""
-    suites = recorded("external.json")["suites"]
+    """Policies and baselines on suites from elsewhere: success, worst tenth of the maps, SPL."""
+    return _suites("external.json")
+
+
+def fresh() -> str:
+    """The same on fresh procedural maps, one hard task each."""
+    return _suites("fresh.json")
+
+
+def _suites(name: str) -> str:
+    suites = recorded(name)["suites"]
     names = [row["agent"] for row in next(iter(suites.values()))]
     rows = [
         [f"{suite} ({rows[0]['num_tasks']} tasks)", *(_with_worst(row) for row in rows)]
         for suite, rows in suites.items()
     ]
-    return markdown_table(["success, worst tenth", *names], rows)
+    return markdown_table(["success, worst tenth, SPL", *names], rows)
 
 
 def _with_worst(row: Entry) -> str:
-    return f"{row['success']['mean']:.2f}, {row['worst_tenth']:.2f}"
+    return f"{row['success']['mean']:.2f}, {worst_tenth(row):.2f}, {row['spl']['mean']:.2f}"
+
+
+def sensors() -> str:
+    """`pretrained:best` with other sensors than it was trained with: success and refused moves."""
+    results = recorded("deployment.json")["results"]
+    tasks = list(dict.fromkeys(entry["tasks"] for entry in results))
+    names = list(dict.fromkeys(entry["sensor"] for entry in results))
+    found = {(entry["sensor"], entry["tasks"]): entry for entry in results}
+    rows = [
+        [name, *(_with_collisions(found[name, each]) for each in tasks if (name, each) in found)]
+        for name in names
+    ]
+    return markdown_table(["success, refused moves an episode", *tasks], rows)
+
+
+def _with_collisions(entry: Entry) -> str:
+    return f"{entry['success']:.2f}, {entry['collisions']:.1f}"
+
+
+def simulator() -> str:
+    """Steps a second with both cores; JaxNav without its reset in every step."""
+    programs = [f"{name}, 2 devices" for name in ("sqn_jax, maze", "sqn_jax, cave", "JaxNav")]
+    entries = recorded(BENCHMARK)["simulator"]
+    return bench_simulator.table([entry for entry in entries if entry["program"] in programs])
+
+
+def breakdown() -> str:
+    """Where the time of a step goes."""
+    return bench_breakdown.table(recorded(BENCHMARK)["breakdown"])
+
+
+def training() -> str:
+    """The whole training program."""
+    return bench_train.table(recorded(BENCHMARK)["train"])
+
+
+def learner() -> str:
+    """R2D2 updates of the preset `paper`, with both cores."""
+    results = recorded(BENCHMARK)["learner"]
+    programs = ("JAX, 2 devices", "PyTorch, 2 threads")
+    updates = [entry for entry in results["updates"] if entry["program"] in programs]
+    return bench_learner.table({**results, "updates": updates})
+
+
+def starts() -> str:
+    """Seconds of commands, and where they go when all programs have been compiled before."""
+    rows = []
+    for name in STARTS:
+        record = recorded(name)
+        parts = [f"{kind} {seconds:.1f}" for kind, seconds in record["warm"]["seconds"].items()]
+        rows.append(
+            [
+                f"`sqn {' '.join(record['command'])}`",
+                *(f"{record[each]['whole']:.1f}" for each in ("cold", "warm")),
+                ", ".join(parts[:5]),
+            ]
+        )
+    header = ["command", "first time, s", "later, s", "of the latter"]
+    return markdown_table(header, rows)
 
 
 TABLES = {
     each.__name__: each
-    for each in (agents, policies, quick, seeds, paper, dead_ends, noise, external)
+    for each in (
+        *(agents, policies, quick, seeds, paper, dead_ends, noise, external, fresh, sensors),
+        *(simulator, breakdown, training, learner, starts),
+    )
 }
 
 

@@ -1,7 +1,8 @@
 """Keep what finished runs came to: python experiments/record_run.py RUN_DIR... --out FILE.json
 
 Writes one JSON file with, for each run folder, its summary, its settings, the final evaluation and
-a learning curve thinned to about fifty rows. Numbers in the README come from such files.
+a learning curve thinned to about fifty rows, and all its points in evaluation. Numbers in the
+README come from such files.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from sqn_jax.config import to_public_dict
+from sqn_jax.storage.metrics import evaluated_rows
 from sqn_jax.storage.run_folder import RunFolder
 
 CURVE = (
     *("episodes", "wall_seconds", "updates", "mean_reward", "success", "epsilon", "loss"),
     *("gate_entropy", "skill_distance", "skill_usage"),
 )
+POINTS = ("eval_mean_reward", "eval_success", "eval_time_steps")
 CURVE_ROWS = 50
 
 
@@ -38,6 +41,9 @@ def record(path: Path) -> dict[str, Any]:
         "evaluation": json.loads((path / "evaluation.json").read_text(encoding="utf-8"))["results"],
         "config": to_public_dict(config),
         "curve": [{name: row[name] for name in CURVE} for row in selected],
+        "eval_curve": [
+            {name: row[name] for name in ("episodes", *POINTS)} for row in evaluated_rows(rows)
+        ],
     }
 
 

@@ -2,9 +2,9 @@
 
     .venv/bin/python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
 
-Trains what is missing, evaluates it, and writes table1.json (with one record an episode in
-table1.jsonl), table1.md and learning_curves.png. With smoke the robots learn next to nothing; it
-shows that everything works.
+Trains what is missing, the K seeds of an agent in one program, evaluates it, and writes table1.json
+(with one record an episode in table1.jsonl), table1.md and learning_curves.png. With smoke the
+robots learn next to nothing; it shows that everything works.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from experiments.common import (
 from sqn_jax import figures
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.agents import group_policies, with_baselines
-from sqn_jax.evaluation.paper_results import PAPER_RESULTS
+from sqn_jax.evaluation.paper_results import PAPER_RESULTS, PAPER_REWARDS
 from sqn_jax.evaluation.scores import markdown_table, results_table
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.run_policies import load_policy
@@ -97,7 +97,9 @@ def main() -> None:
     for folder in folders:
         run_folder, config = RunFolder.open(folder)
         curves.setdefault(config.algo.upper(), []).append(run_folder.read_metrics())
-    figure = figures.learning_curves(curves, title=f"Training, preset {options.preset}")
+    rewards = {algo.upper(): reward for algo, reward in PAPER_REWARDS.items()}
+    title = f"Training, preset {options.preset}"
+    figure = figures.learning_curves(curves, title=title, paper_rewards=rewards)
     figures.save(figure, out / "learning_curves.png")
     trained = group_policies([load_policy(folder) for folder in folders])
     agents = with_baselines(trained, baselines=True)

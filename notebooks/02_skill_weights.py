@@ -259,7 +259,8 @@ print(markdown_table(["skill 1 would", "steps overruled", *ACTION_NAMES], rows))
 #
 # The last layer of the gate is replaced: one skill alone, the weights frozen at their mean over the
 # episodes above or at one half, and the two weights exchanged. The same tasks for each. Success
-# within 0.3 m of the goal with a 95 % Wilson interval; time steps count failures at the limit.
+# within 0.3 m of the goal with a 95 % interval; time steps count failures at the limit. (Shown are
+# intervals over episodes, by Wilson; a new run has them over routes and tasks.)
 
 # %%
 mean_weights = [float(weight) for weight in weights.mean(axis=0, dtype=np.float64)]

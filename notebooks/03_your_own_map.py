@@ -142,7 +142,8 @@ except ValueError as error:
 #
 # The SQN from the maze, the `bug` (a wall follower that sees what the SQN sees) and the `oracle`,
 # which knows the map: hardly anyone can be expected to need fewer steps. The same tasks for all,
-# between the evaluation points, with 95 % Wilson intervals; time steps count failures at the limit.
+# between the evaluation points, with 95 % Wilson intervals (a new run has intervals over routes and
+# tasks); time steps count failures at the limit.
 
 # %%
 policy = find_policy("pretrained:sqn")
@@ -260,6 +261,16 @@ paths_of("as trained" if SMALL else "radius 0.2 m", load_map("maze"), max_panels
 # %% [markdown]
 # To train for the office and a robot of your own instead: `sqn train --map office.yaml
 # --env.forward-speed 1.25 --env.robot-radius 0.2`.
+#
+# Two more questions to an agent. Does it stand a few random actions? And what does it do on tasks
+# that you have written down, in a suite (`tasks.write_suite`, or `sqn tasks`)?
+#
+# ```python
+# measure(with_epsilons([sqn], [0.0, 0.1]), str(path))  # evaluation.agents
+# suite = read_suite(Path("suite.json"))  # tasks
+# evaluation, _ = evaluate_suite_session([sqn], suite, SuiteSettings(eval_seeds=2))  # runs.evaluate
+# print(suite_table(evaluation))  # evaluation.suite_scores
+# ```
 #
 # ## Finding
 #

@@ -98,9 +98,10 @@ figures.picture(
 
 # %% [markdown]
 # Success with its 95 % Wilson interval over episodes (one training seed an agent: how much seeds
-# differ is not in it), and time steps with failures at the limit, with a bootstrap interval. The
-# paper gives numbers for its SQN only in words: "up to 0.2 ... 0.97", "up to 0.85" at 0.3, "up to
-# 40 % ... 0.96", "exceeding 0.80" at 60 %, and "below 0.70" for both baselines at 0.3.
+# differ is not in it), and time steps with failures at the limit, with a bootstrap interval; a new
+# run has both over routes and tasks. The paper gives numbers for its SQN only in words: "up to 0.2
+# ... 0.97", "up to 0.85" at 0.3, "up to 40 % ... 0.96", "exceeding 0.80" at 60 %, and "below 0.70"
+# for both baselines at 0.3.
 
 # %%
 PAPER = {

@@ -15,17 +15,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sqn_jax.env import EnvParams, EnvState, Observation, make_env, reset, step
+    from sqn_jax.policies.greedy import GreedyPolicy, load_policy
 
 __version__ = "0.1.0"
 
-__all__ = ["EnvParams", "EnvState", "Observation", "__version__", "make_env", "reset", "step"]
+__all__ = [
+    "EnvParams",
+    "EnvState",
+    "GreedyPolicy",
+    "Observation",
+    "__version__",
+    "load_policy",
+    "make_env",
+    "reset",
+    "step",
+]
+
+_POLICIES = ("GreedyPolicy", "load_policy")
 
 
 def __getattr__(name: str) -> Any:
     """Load what is named in `__all__` upon its first use (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module("sqn_jax.env"), name)
+    place = "sqn_jax.policies.greedy" if name in _POLICIES else "sqn_jax.env"
+    value = getattr(importlib.import_module(place), name)
     globals()[name] = value
     return value
 

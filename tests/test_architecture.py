@@ -34,7 +34,9 @@ PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING = ("sqn_jax/figures/", "sqn_jax/report/")
 JIT = (
     "sqn_jax/training/loop.py",
-    *("sqn_jax/evaluation/episodes.py", "sqn_jax/evaluation/recording.py"),
+    *("sqn_jax/evaluation/baseline_episodes.py", "sqn_jax/evaluation/episodes.py"),
+    "sqn_jax/evaluation/recording.py",
+    *("sqn_jax/policies/greedy.py", "sqn_jax/export/rollout.py"),
     *("experiments/bench_simulator.py", "experiments/bench_learner.py"),
     *("experiments/bench_breakdown.py", "experiments/check_gpu.py", "notebooks/01_first_steps.py"),
 )

@@ -25,6 +25,7 @@ from sqn_jax import tasks as suites_of_tasks
 from sqn_jax.cli import main
 from sqn_jax.config.map_names import MapFile, ProjectMap, parse
 from sqn_jax.config.presets import PRESETS
+from sqn_jax.export import check, folder
 from sqn_jax.figures import style
 from sqn_jax.maps import known_maps
 from sqn_jax.policies import pretrained
@@ -35,12 +36,14 @@ from sqn_jax.storage.run_folder import RunFolder
 
 ROOT = Path(__file__).resolve().parents[1]
 README, USAGE = ROOT / "README.md", ROOT / "docs" / "USAGE.md"
+DEPLOYMENT = ROOT / "docs" / "DEPLOYMENT.md"
 RECORDS = ROOT / "experiments" / "results"
 PAGES = sorted(
     [
         *(README, ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")),
         *(ROOT / "experiments" / "README.md", RECORDS / "README.md"),
         *(
+            ROOT / "examples" / "ros2" / "README.md",
             ROOT / "notebooks" / "README.md",
             ROOT / "sqn_jax" / "policies" / "weights" / "README.md",
         ),
@@ -61,6 +64,7 @@ SMALLER = {
     | {"--animations": ["--animations", "1"], "--map": ["--map", "maze"]},
     "map": {},
     "tasks": {"--count": ["--count", "1"]},
+    "export": {},
 }
 
 
@@ -91,12 +95,14 @@ def prose_words(text: str) -> int:
 
 def blocks(page: Path, language: str) -> list[str]:
     """The code blocks of a page in a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), flags=re.M | re.S)
+    fences = re.findall(r"^```(\w*)\n(.*?)^```$", text_of(page), flags=re.M | re.S)
+    return [block for found, block in fences if found == language]
 
 
 def commands(page: Path) -> list[str]:
     """The lines of the shell blocks of a page."""
-    return [line for block in blocks(page, "sh") for line in block.splitlines() if line.strip()]
+    whole = [block.replace("\\\n", " ") for block in blocks(page, "sh")]
+    return [line for block in whole for line in block.splitlines() if line.strip()]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -227,15 +233,17 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def prepare(options: Any, settings: Any) -> None:
         raise Begun
 
-    def read_runs(names: list[str], checkpoint: int | str) -> list[Any]:
-        return [type("Run", (), {"policy": find_policy(name, checkpoint)}) for name in names]
+    def read_runs(names: list[str], *which: Any) -> list[Any]:
+        return [type("Run", (), {"policy": find_policy(name, *which)}) for name in names]
 
-    def begin(*_: Any) -> None:
+    def begin(*_: Any, **options: Any) -> None:
         raise Begun
 
     cli_tasks = importlib.import_module("sqn_jax.cli.tasks")
     for name in ("_convert", "_generate", "_check"):
         monkeypatch.setattr(cli_tasks, name, begin)
+    for module, name in ((folder, "export_policy"), (check, "check_export")):
+        monkeypatch.setattr(module, name, begin)
     for module, function in (
         *((pretrained, find_policy), (train, train_session), (evaluate, evaluate_session)),
         *((render, render_session), (report, write_report), (report, read_runs)),
@@ -249,7 +257,7 @@ SCRIPTS: dict[str, Callable[[], None]] = {"table": table1.main, "robustness": ro
 
 
 @pytest.mark.usefixtures("_only_read")
-@pytest.mark.parametrize("line", [*commands(README), *commands(USAGE)])
+@pytest.mark.parametrize("line", [*commands(README), *commands(USAGE), *commands(DEPLOYMENT)])
 def test_every_command_is_one_that_can_be_given(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *words = shlex.split(line, comments=True)
     if program == "make":

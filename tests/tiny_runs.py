@@ -42,6 +42,7 @@ class TinyRuns:
             "rounds-per-chunk": "1",
             "checkpoint-minutes": "1e-6",
             "eval.episodes": "2",
+            "eval.curve-points": "5",
             "num-devices": "1",
             **{name.replace("__", ".").replace("_", "-"): value for name, value in more.items()},
         }

@@ -11,21 +11,31 @@ three things:
 
 A crossing needs a place nearer by `PROGRESS` than all before. A robot that comes to the same pose
 again while following a wall runs in a circle: it goes into the open and takes the other hand.
-Angles are relative to the robot's heading, positive to the left, unless said otherwise.
+Angles are relative to the robot's heading, positive to the left, unless said otherwise. All is for
+one robot, in JAX: an episode runs in a compiled program, as that of a network.
 """
 
 from __future__ import annotations
 
-import cmath
 import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env.geometry import beam_angles, decode_distance, farthest_shown, wrap_angle
+from sqn_jax.env.arithmetic import larger, smaller
+from sqn_jax.env.geometry import beam_angles, decode_goal, farthest_shown, wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
+from sqn_jax.env.params import Observation
 
+GO, FOLLOW, CROSS = range(3)
+"""What the robot does, see above."""
 FINENESS = 3
 """Directions looked at for each turn of one step."""
 SIDE_CLEARANCE = 0.06
@@ -56,230 +66,333 @@ SAME_PLACE = 0.1
 BREAK_OUT = 2.5
 """m; how places are rounded to notice a circle, and how far the robot then goes into the open."""
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+
+@struct.dataclass
+class BugMemory:
+    """What a robot remembers. Places, [2] m, are in the frame of the start, by dead reckoning."""
+
+    goal_radius: Array
+    """m, of the task."""
+    turned: Array
+    """int32: turns since the start, to the left less those to the right."""
+    place: Array
+    """Where it is."""
+    goal: Array
+    """NaN before the first observation."""
+    mode: Array
+    """int32: `GO`, `FOLLOW` or `CROSS`."""
+    hand: Array
+    """int32: 1, obstacles are passed on their left, the wall stays at the right; or -1."""
+    wall: Array
+    """rad, where the nearest point of the wall is seen."""
+    nearest: Array
+    """m, least distance to the goal of any place reached or in sight."""
+    crossing_to: Array
+    """The place that a crossing leads to."""
+    crossing_left: Array
+    """int32: moves after which it is given up."""
+    last_heading: Array
+    """rad from the first heading: that of the last move."""
+    visited: Array
+    """[T, 2] int32: poses while following, rounded."""
+    num_visited: Array
+    """int32: how many of them count."""
+    turns_left: Array
+    """int32: turns still to make before the next decision, to the left if above 0."""
+    then_forward: Array
+    """bool: whether a move belongs to them."""
 
 
-class BugNavigator:
-    """Chooses actions for E robots, each with its own memory."""
+@dataclass(frozen=True)
+class Bug:
+    """The wall follower for a robot with this body, these beams and these actions."""
 
-    def __init__(self, config: EnvConfig, num_robots: int) -> None:
-        """Start E episodes of a robot with this body, these beams and these actions."""
-        self.config = config
-        self.beams = beam_angles(config)
-        turn = config.turn_rate * config.time_step
-        if turn <= 0 or config.forward_speed * config.time_step <= 0:
+    config: EnvConfig
+
+    def __post_init__(self) -> None:
+        if self.turn <= 0 or self.stride <= 0:
             raise ValueError("the robot cannot move or turn, expected speeds above 0")
-        count = max(4, round(2 * math.pi / turn)) * FINENESS
-        self.directions = 2 * math.pi / count * np.arange(count)
-        apart = self.beams[None] - self.directions[:, None]
-        self._ahead = np.cos(apart).astype(np.float32)
-        self._aside = np.sin(apart).astype(np.float32)
-        # A direction between two beams, and straight behind, is judged by the nearest beam.
-        nearest = np.abs(wrap_angle(apart)).min(axis=1)
-        self._gap = np.sin(nearest + 1e-3).astype(np.float32)[:, None]
-        self.robots = [_Robot(self) for _ in range(num_robots)]
 
-    def choose(self, ranges: Floats, goal: Floats) -> Ints:
-        """Actions [E] from the observed ranges [E, R] and goals [E, 2 or 3], all in 0..1."""
-        readings = ranges * self.config.max_range
-        clear = self.clear_lengths(readings)
-        distance = decode_distance(goal[:, 0], self.config)
-        if self.config.heading_encoding == "linear":
-            heading = goal[:, 1] * 2 * np.pi - np.pi
-        else:
-            heading = np.arctan2(goal[:, 1] * 2 - 1, goal[:, 2] * 2 - 1)
-        seen = zip(self.robots, readings, clear, distance, heading, strict=True)
-        return np.array([robot.choose(*what) for robot, *what in seen])
+    @property
+    def turn(self) -> float:
+        """rad a step."""
+        return self.config.turn_rate * self.config.time_step
 
-    def clear_lengths(self, readings: Floats, side_clearance: float = SIDE_CLEARANCE) -> Floats:
-        """How far [E, D] m robots could move in each direction by readings [E, R] m.
+    @property
+    def stride(self) -> float:
+        """m, forward in one step."""
+        return self.config.forward_speed * self.config.time_step
+
+    def _can_move(self, clear: Array) -> Array:
+        """Where so many m are clear for a move."""
+        return clear >= self.stride + FRONT_CLEARANCE
+
+    @property
+    def num_directions(self) -> int:
+        """Directions looked at, D."""
+        return max(4, round(2 * math.pi / self.turn)) * FINENESS
+
+    @cached_property
+    def beams(self) -> NDArray[np.float64]:
+        """[R] rad."""
+        return beam_angles(self.config)
+
+    @cached_property
+    def directions(self) -> NDArray[np.float32]:
+        """[D] rad, from the heading to the left."""
+        numbers = np.arange(self.num_directions)
+        return (2 * math.pi / self.num_directions * numbers).astype(np.float32)
+
+    def start(self, max_steps: int, goal_radius: Array) -> BugMemory:
+        """The memory at the start of an episode of at most so many steps."""
+        return BugMemory(
+            goal_radius=goal_radius,
+            turned=jnp.int32(0),
+            place=jnp.zeros(2),
+            goal=jnp.full(2, jnp.nan),
+            mode=jnp.int32(GO),
+            hand=jnp.int32(1),
+            wall=jnp.float32(0),
+            nearest=jnp.float32(jnp.inf),
+            crossing_to=jnp.zeros(2),
+            crossing_left=jnp.int32(0),
+            last_heading=jnp.float32(math.pi),
+            visited=jnp.zeros((max_steps, 2), jnp.int32),
+            num_visited=jnp.int32(0),
+            turns_left=jnp.int32(0),
+            then_forward=jnp.bool_(False),
+        )
+
+    def clear_lengths(self, readings: Array, side_clearance: float = SIDE_CLEARANCE) -> Array:
+        """How far [D] m the robot could move in each direction by readings [R] m.
 
         Args:
             readings: what the beams show, m.
             side_clearance: m to keep from obstacles at each side.
         """
+        apart = self.beams[None] - self.directions[:, None]
         width = self.config.robot_radius + side_clearance
-        away = readings.astype(np.float32)[:, None]
-        ahead, aside = away * self._ahead, away * self._aside
+        away = jnp.asarray(readings, jnp.float32)[None]
+        ahead = away * np.cos(apart).astype(np.float32)
+        aside = away * np.sin(apart).astype(np.float32)
+        # A direction between two beams, and straight behind, is judged by the nearest beam.
+        nearest = np.abs(wrap_angle(apart)).min(axis=1)
+        gap = np.sin(nearest + 1e-3).astype(np.float32)[:, None]
         hit = (
-            (np.abs(aside) < np.maximum(width, away * self._gap))
+            (jnp.abs(aside) < larger(away * gap, width))
             & (ahead > GRAZING * away)
             & (away < self.config.max_range * 0.999)
         )
-        reach = ahead - np.sqrt(np.maximum(width**2 - aside**2, 0))
-        return np.where(hit, np.maximum(reach, 0), self.config.max_range).min(axis=-1)
+        reach = ahead - jnp.sqrt(larger(width**2 - aside**2, 0.0))
+        return jnp.where(hit, larger(reach, 0.0), self.config.max_range).min(axis=1)
 
+    def act(self, memory: BugMemory, obs: Observation) -> tuple[BugMemory, Array]:
+        """One action from what is seen."""
+        readings = obs.ranges * self.config.max_range
+        clear = self.clear_lengths(readings)
+        memory, distance, bearing = self._locate_goal(memory, obs.goal)
+        is_due = (memory.turns_left == 0) & ~(memory.then_forward & self._can_move(clear[0]))
+        decided, direction = self._decide(memory, readings, clear, distance, bearing)
+        to_left = direction <= self.num_directions // 2
+        signed = jnp.where(to_left, direction, direction - self.num_directions)
+        decided = replace(decided, turns_left=jnp.round(signed / FINENESS).astype(jnp.int32))
+        memory = _choose(is_due, decided, memory)
+        return self._move(memory, clear)
 
-class _Robot:
-    """The memory and the decisions of one robot."""
-
-    def __init__(self, bug: BugNavigator) -> None:
-        config = bug.config
-        self.bug = bug
-        self.count = len(bug.directions)
-        self.spacing = 2 * math.pi / self.count
-        self.turn = config.turn_rate * config.time_step
-        self.stride = config.forward_speed * config.time_step
-        self.reverse = config.backward_speed * config.time_step
-        self.needed = self.stride + FRONT_CLEARANCE
-        # Dead reckoning from commands; complex numbers are places, in the frame of the start.
-        self.heading, self.place = 0.0, 0j
-        self.goal: complex | None = None
-        self.mode = "go"
-        self.hand = 1  # +1: obstacles are passed on their left, the wall stays at the right
-        self.wall = 0.0  # where the nearest point of the wall is seen
-        self.nearest = math.inf  # least distance to the goal of any place reached or in sight
-        self.crossing_to, self.crossing_left = 0j, 0
-        self.last_heading = math.pi  # heading of the last move
-        self.visited: set[tuple[int, ...]] = set()  # poses while following, rounded
-        self.turns_left, self.then_forward = 0, False
-
-    def choose(self, readings: Floats, clear: Floats, distance: float, heading: float) -> int:
-        """One action from readings [R] m, clear lengths [D] m and where the goal is, m and rad."""
-        self._locate_goal(distance, heading)
-        if not self.turns_left and not (self.then_forward and clear[0] >= self.needed):
-            direction = self._decide(readings, clear)
-            self.turns_left = round(math.remainder(direction, 2 * math.pi) / self.turn)
-        if self.turns_left:
+    def _move(self, memory: BugMemory, clear: Array) -> tuple[BugMemory, Array]:
+        """Turn, or move where nothing is left to turn; back out if no direction is clear."""
+        sign = jnp.sign(memory.turns_left)
+        heading = memory.turned * self.turn
+        reverse = self.config.backward_speed * self.config.time_step
+        can_move = self._can_move(clear[0])
+        can_reverse = clear[self.num_directions // 2] >= reverse + FRONT_CLEARANCE
+        length = jnp.where(can_move, self.stride, jnp.where(can_reverse, -reverse, 0.0))
+        moved = replace(
+            memory,
+            then_forward=jnp.bool_(False),
+            place=memory.place + _vector(length, heading),
+            last_heading=jnp.where(can_move, heading, memory.last_heading),
+        )
+        turned = replace(
+            memory,
             # The move belongs to the turn: without it two choices could alternate on the spot.
-            self.then_forward = True
-            sign = 1 if self.turns_left > 0 else -1
-            self.turns_left -= sign
-            self.heading += sign * self.turn
-            self.wall -= sign * self.turn
-            return LEFT if sign > 0 else RIGHT
-        self.then_forward = False
-        if clear[0] < self.needed:
-            return self._escape(clear)
-        self.place += cmath.rect(self.stride, self.heading)
-        self.last_heading = self.heading
-        return FORWARD
+            then_forward=jnp.bool_(True),
+            turns_left=memory.turns_left - sign,
+            turned=memory.turned + sign,
+            wall=memory.wall - sign * self.turn,
+        )
+        move = jnp.where(can_move, FORWARD, jnp.where(can_reverse, BACKWARD, STAND))
+        action = jnp.where(sign > 0, LEFT, jnp.where(sign < 0, RIGHT, move))
+        return _choose(sign != 0, turned, moved), action
 
-    def _escape(self, clear: Floats) -> int:
-        """What is left when no direction is clear enough to move."""
-        if clear[self.count // 2] >= self.reverse + FRONT_CLEARANCE:
-            self.place -= cmath.rect(self.reverse, self.heading)
-            return BACKWARD
-        return STAND
+    def _locate_goal(self, memory: BugMemory, goal: Array) -> tuple[BugMemory, Array, Array]:
+        """Note where the goal is; beyond the largest distance that is shown, by its bearings.
 
-    def _locate_goal(self, distance: float, heading: float) -> None:
-        """Note where the goal is; beyond the largest distance that is shown, by its bearings."""
-        ray = cmath.rect(1.0, self.heading + heading)
-        shown = farthest_shown(self.bug.config)
-        if distance >= shown * (1 - 1e-6):
-            guess = self.place + 1.2 * shown * ray if self.goal is None else self.goal
-            distance = max(shown, ((guess - self.place) * ray.conjugate()).real)
-        self.goal = self.place + distance * ray
-        self.distance, self.bearing = distance, heading
-        self.nearest = min(self.nearest, distance)
+        Returns:
+            The memory, and the goal's distance, m, and bearing, rad.
+        """
+        shown = farthest_shown(self.config)
+        distance, bearing = decode_goal(goal, self.config)
+        ray = _vector(jnp.float32(1), memory.turned * self.turn + bearing)
+        if math.isfinite(shown):
+            unknown = jnp.isnan(memory.goal)
+            guess = jnp.where(unknown, memory.place + 1.2 * shown * ray, memory.goal)
+            far = larger(jnp.dot(guess - memory.place, ray), shown)
+            distance = jnp.where(distance >= shown * (1 - 1e-6), far, distance)
+        nearest = smaller(memory.nearest, distance)
+        place = memory.place + distance * ray
+        return replace(memory, goal=place, nearest=nearest), distance, bearing
 
-    def _decide(self, readings: Floats, clear: Floats) -> float:
-        """The direction to move in."""
-        onward = np.cos(self.bug.directions - self.bearing)
-        length = np.clip(self.distance * onward, 0, clear)
-        left = np.sqrt(self.distance**2 - 2 * self.distance * length * onward + length**2)
-        ahead = self._index(self.bearing)
-        if clear[ahead] > self.distance - self.bug.config.goal_radius / 2:
-            self.mode = "go"
-            passes = self.distance * abs(math.sin(self.bearing)) < self.bug.config.goal_radius * 0.7
-            straight = passes and abs(self.bearing) < math.pi / 4 and clear[0] >= self.needed
-            return 0.0 if straight else self._toward(self.bearing, clear)
-        if self.mode == "follow" and left.min() < self.nearest - PROGRESS:
-            best = int(left.argmin())
-            direction = self.heading + float(self.bug.directions[best])
-            self.crossing_to = self.place + cmath.rect(float(length[best]), direction)
-            self.crossing_left, self.mode = CROSSING_STEPS, "cross"
-        if self.mode == "cross":
-            offset = self.crossing_to - self.place
-            self.crossing_left -= 1
-            if abs(offset) > self.stride and self.crossing_left > 0:
-                return self._toward(cmath.phase(offset) - self.heading, clear)
-            self.mode = "go"
-        if self.mode == "go":
-            hand, edge = self._nearer_edge(clear, ahead)
-            self.hand = hand
-            if edge is not None and left[edge] < self.distance - PROGRESS / 2:
-                return self._toward(float(self.bug.directions[edge]), clear)
-            best = int(left.argmin())
-            if left[best] < self.distance - CLOSE_UP:
-                return self._toward(float(self.bug.directions[best]), clear)
-            self.mode, self.wall = "follow", self.bearing
-            self.visited.clear()
-            self.nearest = min(self.nearest, float(left.min()))
-        return self._along_wall(readings, clear)
+    def _decide(
+        self, memory: BugMemory, readings: Array, clear: Array, distance: Array, bearing: Array
+    ) -> tuple[BugMemory, Array]:
+        """The number of the direction to move in."""
+        apart = self.directions - bearing
+        length = jnp.clip(distance * jnp.cos(apart), 0, clear)
+        left = jnp.hypot(distance - length * jnp.cos(apart), length * jnp.sin(apart))
+        best, least = jnp.argmin(left), left.min()
+        ahead = jnp.round(bearing / (2 * jnp.pi) * self.num_directions).astype(jnp.int32)
+        ahead = ahead % self.num_directions
+        sees_goal = clear[ahead] > distance - memory.goal_radius / 2
+        passes = distance * jnp.abs(jnp.sin(bearing)) < memory.goal_radius * 0.7
+        straight = sees_goal & passes & (jnp.abs(bearing) < jnp.pi / 4) & self._can_move(clear[0])
 
-    def _nearer_edge(self, clear: Floats, ahead: int) -> tuple[int, int | None]:
-        """On which hand the obstacle ahead is passed on the shorter path, and the direction there.
+        leaves = (memory.mode == FOLLOW) & (least < memory.nearest - PROGRESS)
+        memory_on, onward, is_crossing = self._cross(
+            _choose(leaves, self._crossing(memory, length[best], best), memory)
+        )
+        hand, edge, has_edge = self._nearer_edge(memory_on.hand, clear, ahead, distance, bearing)
+        goes = memory_on.mode == GO
+        by_edge = goes & has_edge & (left[edge] < distance - PROGRESS / 2)
+        closes_up = goes & ~by_edge & (least < distance - CLOSE_UP)
+        memory_on = replace(memory_on, hand=jnp.where(goes, hand, memory_on.hand))
+        begins = replace(
+            memory_on,
+            mode=jnp.int32(FOLLOW),
+            wall=bearing,
+            num_visited=jnp.int32(0),
+            nearest=smaller(memory.nearest, least),
+        )
+        follows = ~(is_crossing | by_edge | closes_up)
+        memory_on = _choose(goes & follows, begins, memory_on)
+        along, by_wall, broken_out, out = self._along_wall(memory_on, readings, clear)
+        memory_on = _choose(follows, along, memory_on)
+
+        target = jnp.where(follows, out, jnp.where(by_edge, edge, best))
+        aim = jnp.where(is_crossing, onward, jnp.asarray(self.directions)[target])
+        toward = self._toward(jnp.where(sees_goal, bearing, aim), clear)
+        direction = jnp.where(follows & ~broken_out & ~sees_goal, by_wall, toward)
+        memory = _choose(sees_goal, replace(memory, mode=jnp.int32(GO)), memory_on)
+        return memory, jnp.where(straight, 0, direction)
+
+    def _crossing(self, memory: BugMemory, length: Array, direction: Array) -> BugMemory:
+        """Begin to cross to a place so far away, m, in a direction, by its number."""
+        angle = memory.turned * self.turn + jnp.asarray(self.directions)[direction]
+        return replace(
+            memory,
+            mode=jnp.int32(CROSS),
+            crossing_to=memory.place + _vector(length, angle),
+            crossing_left=jnp.int32(CROSSING_STEPS),
+        )
+
+    def _cross(self, memory: BugMemory) -> tuple[BugMemory, Array, Array]:
+        """Go on crossing: where it leads, rad, and whether it does; else the robot goes again."""
+        offset = memory.crossing_to - memory.place
+        is_crossing = memory.mode == CROSS
+        left = memory.crossing_left - is_crossing
+        goes_on = is_crossing & (jnp.hypot(offset[0], offset[1]) > self.stride) & (left > 0)
+        mode = jnp.where(is_crossing & ~goes_on, GO, memory.mode)
+        onward = jnp.arctan2(offset[1], offset[0]) - memory.turned * self.turn
+        return replace(memory, mode=mode, crossing_left=left), onward, goes_on
+
+    def _nearer_edge(
+        self, hand: Array, clear: Array, ahead: Array, distance: Array, bearing: Array
+    ) -> tuple[Array, Array, Array]:
+        """On which hand the obstacle ahead is passed on the shorter path.
 
         The path leads beside the obstacle's end and from there straight to the goal; the hand of
         before has an advantage, so that small changes do not reverse it.
+
+        Returns:
+            The hand, the number of the direction there, and whether there is any.
         """
-        best = math.inf
-        choice: tuple[int, int | None] = (self.hand, None)
-        for hand in (1, -1):
-            for k in range(1, self.count // 2):
-                beside, beyond = (ahead + hand * (k - 1)) % self.count, (ahead + hand * k)
-                beyond %= self.count
-                if clear[beyond] < min(clear[beside] + EDGE, self.bug.config.max_range):
-                    continue
-                to_edge = float(clear[beside])
-                angle = float(self.bug.directions[beyond]) - self.bearing
-                rest = abs(self.distance - cmath.rect(to_edge, angle))
-                cost = to_edge + rest + (EDGE if hand != self.hand else 0.0)
-                if cost < best:
-                    best, choice = cost, (hand, beyond)
-                break
-        return choice
+        numbers = np.arange(1, self.num_directions // 2)
+        costs, edges = [], []
+        for side in (1, -1):
+            beside = (ahead + side * (numbers - 1)) % self.num_directions
+            beyond = (ahead + side * numbers) % self.num_directions
+            deeper = clear[beyond] >= smaller(clear[beside] + EDGE, self.config.max_range)
+            first = jnp.argmax(deeper)
+            to_edge, edge = clear[beside[first]], beyond[first]
+            angle = jnp.asarray(self.directions)[edge] - bearing
+            rest = jnp.hypot(distance - to_edge * jnp.cos(angle), to_edge * jnp.sin(angle))
+            cost = to_edge + rest + jnp.where(hand == side, 0.0, EDGE)
+            costs.append(jnp.where(deeper.any(), cost, jnp.inf))
+            edges.append(edge)
+        first_is_best = costs[0] <= costs[1]
+        has_edge = smaller(*costs) < jnp.inf
+        edge = jnp.where(first_is_best, edges[0], edges[1])
+        return jnp.where(has_edge, jnp.where(first_is_best, 1, -1), hand), edge, has_edge
 
-    def _along_wall(self, readings: Floats, clear: Floats) -> float:
-        """The direction nearest to the followed wall that is clear, counted away from it."""
-        if self._was_here():
-            return self._break_out(clear)
-        apart = wrap_angle(self.bug.beams - self.wall)
-        near = np.flatnonzero(np.abs(apart) <= WALL_WINDOW)
-        if near.size:
-            self.wall = float(self.bug.beams[near[readings[near].argmin()]])
-        first = round(self.wall / self.turn)
-        headings = (first + self.hand * np.arange(self.count // FINENESS)) * FINENESS % self.count
-        wide = self.bug.clear_lengths(readings[None], WALL_CLEARANCE)[0]
-        turned = self.bug.directions[headings] + self.heading - self.last_heading
-        onward = np.cos(turned) > math.cos(math.pi - RETURN)
+    def _along_wall(
+        self, memory: BugMemory, readings: Array, clear: Array
+    ) -> tuple[BugMemory, Array, Array, Array]:
+        """Follow the wall, or break out of a circle.
+
+        Returns:
+            The memory; the number of the direction nearest to the wall that is clear, counted away
+            from it; whether the robot breaks out instead; and then in which direction.
+        """
+        memory, was_here = self._note_pose(memory)
+        heading = memory.turned * self.turn
+        onward = jnp.cos(self.directions + heading - memory.last_heading)
+        out = jnp.argmax(clear + 0.1 * onward)
+        # Out of a circle, mostly a bay too small to turn in, to the open; then the other hand.
+        breaks_out = self._crossing(memory, smaller(clear[out], BREAK_OUT), out)
+        breaks_out = replace(breaks_out, num_visited=jnp.int32(0), hand=-memory.hand)
+
+        near = jnp.abs(wrap_angle(self.beams.astype(np.float32) - memory.wall)) <= WALL_WINDOW
+        nearest = jnp.argmin(jnp.where(near, readings, jnp.inf))
+        seen = jnp.asarray(self.beams, jnp.float32)[nearest]
+        wall = jnp.where(near.any(), seen, memory.wall)
+        first = jnp.round(wall / self.turn).astype(jnp.int32)
+        outward = np.arange(self.num_directions // FINENESS)
+        headings = (first + memory.hand * outward) * FINENESS % self.num_directions
+        is_onward = (onward > math.cos(math.pi - RETURN))[headings]
         # In a notch the nearest wall may be the one left behind: back only if nothing else is.
-        roomy, narrow = wide[headings] >= HUG, clear[headings] >= self.needed
-        for free in (roomy & onward, narrow & onward, narrow):
-            if free.any():
-                return float(self.bug.directions[headings[free.argmax()]])
-        return float(self.bug.directions[headings[clear[headings].argmax()]])
+        roomy = self.clear_lengths(readings, WALL_CLEARANCE)[headings] >= HUG
+        narrow, choice = self._can_move(clear[headings]), jnp.argmax(clear[headings])
+        for free in (narrow, narrow & is_onward, roomy & is_onward):
+            choice = jnp.where(free.any(), jnp.argmax(free), choice)
+        memory = _choose(was_here, breaks_out, replace(memory, wall=wall))
+        return memory, headings[choice], was_here, out
 
-    def _was_here(self) -> bool:
+    def _note_pose(self, memory: BugMemory) -> tuple[BugMemory, Array]:
         """Whether the robot runs in a circle: this pose comes a second time on this wall."""
-        turns = round(self.heading / self.turn) % (self.count // FINENESS)
-        x, y = round(self.place.real / SAME_PLACE), round(self.place.imag / SAME_PLACE)
-        pose = (x, y, turns, self.hand)
-        known = pose in self.visited
-        self.visited.add(pose)
-        return known
+        x, y = jnp.round(memory.place / SAME_PLACE).astype(jnp.int32)
+        heading = memory.turned % (self.num_directions // FINENESS)
+        pose = jnp.stack([(x << 16) + y, 2 * heading + (memory.hand > 0)])
+        counted = jnp.arange(len(memory.visited)) < memory.num_visited
+        known = ((memory.visited == pose[None]).all(axis=1) & counted).any()
+        visited = memory.visited.at[memory.num_visited].set(pose)
+        return replace(memory, visited=visited, num_visited=memory.num_visited + 1), known
 
-    def _break_out(self, clear: Floats) -> float:
-        """Leave a circle, mostly a bay too small to turn in, to the open; then the other hand."""
-        self.visited.clear()
-        self.hand, self.mode, self.crossing_left = -self.hand, "cross", CROSSING_STEPS
-        onward = np.cos(self.bug.directions + self.heading - self.last_heading)
-        best = int((clear + 0.1 * onward).argmax())
-        direction = float(self.bug.directions[best])
-        length = min(float(clear[best]), BREAK_OUT)
-        self.crossing_to = self.place + cmath.rect(length, self.heading + direction)
-        return self._toward(direction, clear)
+    def _toward(self, direction: Array, clear: Array) -> Array:
+        """The number of the heading that is clear and nearest to a direction, the present first."""
+        steady = jnp.abs(wrap_angle(direction)) < STEADY * self.turn
+        headings = np.arange(0, self.num_directions, FINENESS)
+        apart = jnp.abs(wrap_angle(self.directions[headings] - direction))
+        apart = apart + jnp.where(self._can_move(clear[headings]), 0.0, 2 * jnp.pi)
+        nearest = jnp.argmin(apart) * FINENESS
+        return jnp.where(steady & self._can_move(clear[0]), 0, nearest)
 
-    def _toward(self, direction: float, clear: Floats) -> float:
-        """The heading that is clear and nearest to a direction, the present one preferred."""
-        if abs(wrap_angle(direction)) < STEADY * self.turn and clear[0] >= self.needed:
-            return 0.0
-        headings = np.arange(0, self.count, FINENESS)
-        apart = np.abs(wrap_angle(self.bug.directions[headings] - direction))
-        apart = apart + np.where(clear[headings] >= self.needed, 0.0, 2 * np.pi)
-        return float(self.bug.directions[headings[apart.argmin()]])
 
-    def _index(self, angle: float) -> int:
-        return round(angle / self.spacing) % self.count
+def _vector(length: Array, angle: Array) -> Array:
+    """[2] of this length, m, in this direction."""
+    return length * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def _choose(condition: Array, one: BugMemory, other: BugMemory) -> BugMemory:
+    """One memory or the other."""
+    chosen: BugMemory = jax.tree.map(lambda x, y: jnp.where(condition, x, y), one, other)
+    return chosen

@@ -12,13 +12,15 @@ velocity a short search repairs the plan after each step. Beam search is not pro
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sqn_jax.baselines.shortest_paths import ShortestPaths
+from sqn_jax.baselines.shortest_paths import ShortestPaths, wrapped_once
 from sqn_jax.env import EnvParams
 from sqn_jax.env.geometry import wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
@@ -27,7 +29,11 @@ from sqn_jax.maps import OccupancyMap, traversable
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+MOVES = [FORWARD, BACKWARD, LEFT, RIGHT]
 INVERSE = np.array([-1, BACKWARD, FORWARD, RIGHT, LEFT])
+NOWHERE = np.iinfo(np.int64).max
+LARGEST_ESTIMATE = 1e6
+"""Steps; where no path leads to the goal, they would be infinitely many."""
 
 BEAM = 100
 """Poses per episode and step while the whole path is planned."""
@@ -36,6 +42,8 @@ REPAIR_STEPS = 14
 """Size of the search after a step that led elsewhere than planned."""
 ON_PLAN = 1e-3
 """A pose this near to the planned one, m and rad, is the planned one."""
+ROBOTS_AT_ONCE = 50
+"""Robots whose plans are searched together, by one of the processor's cores."""
 SIDE_MARGIN = 1e-3
 """m that a planned move keeps from obstacles, so that float32 in the simulator agrees."""
 
@@ -47,29 +55,36 @@ class Oracle:
         """Compute the paths to all goals [E, 2]; a goal that occurs twice is computed once."""
         self.search = BeamSearch(occupancy_map, env_params, goals)
         self.goals = goals
-        self.steps_left = env_params.max_steps
         self.repairs = env_params.config.velocity_noise > 0
         self.arrived = np.zeros(len(goals), dtype=bool)
-        self.actions: list[Ints] = [np.empty(0, np.int64)] * len(goals)
-        self.planned: list[Floats] = [np.empty((0, 3))] * len(goals)
+        self.step = 0
+        self.max_steps = env_params.max_steps
+        self.actions = np.full((len(goals), self.max_steps), STAND, np.int8)
+        """What is planned for each step of the episode."""
+        self.planned = np.full((len(goals), self.max_steps, 3), np.nan, np.float32)
+        """Where the robots are before each of these actions; NaN where nothing is planned."""
         self.before: tuple[Floats, Ints] | None = None
+
+    def prepare(self, poses: Floats) -> None:
+        """Plan from the first poses [E, 3], which `choose` will get: beside other work, say."""
+        self._plan(np.arange(len(poses)), poses)
 
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
         self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.search.goal_radius
         if self.before is not None and not self.repairs:
             self._note_refusals(poses, *self.before)
-        lost = [i for i in np.flatnonzero(~self.arrived) if not self._is_on_plan(int(i), poses[i])]
-        if lost:
-            self._plan(np.array(lost), poses[lost])
-        chosen = np.full(len(poses), STAND)
-        for i in np.flatnonzero(~self.arrived):
-            if len(self.actions[i]):
-                chosen[i] = self.actions[i][0]
-                self.actions[i], self.planned[i] = self.actions[i][1:], self.planned[i][1:]
-        self.steps_left -= 1
+        lost = np.flatnonzero(~self.arrived & ~_is_at(poses, self.planned[:, self.step]))
+        if lost.size:
+            self._plan(lost, poses[lost])
+        chosen = np.where(self.arrived, STAND, self.actions[:, self.step]).astype(np.int64)
+        self.step += 1
         self.before = poses, chosen
         return chosen
+
+    def outlook(self) -> NDArray[np.int8]:
+        """Actions [E, T'] of all steps to come, if everything goes as planned."""
+        return np.where(self.arrived[:, None], np.int8(STAND), self.actions[:, self.step :])
 
     def _note_refusals(self, poses: Floats, before: Floats, taken: Ints) -> None:
         """Moves that the simulator has refused, so that no plan contains them again."""
@@ -77,18 +92,19 @@ class Oracle:
         for i in np.flatnonzero(stood & np.isin(taken, (FORWARD, BACKWARD))):
             self.search.refused.append((int(i), before[i], int(taken[i])))
 
-    def _is_on_plan(self, robot: int, pose: Floats) -> bool:
-        return len(self.actions[robot]) > 0 and bool(_is_at(pose, self.planned[robot][0]))
-
     def _plan(self, robots: Ints, poses: Floats) -> None:
         """Whole paths, with a wider beam if need be; under noise repaired, except the first."""
-        attempts = [(BEAM, self.steps_left), (4 * BEAM, self.steps_left)]
+        steps = self.max_steps - self.step
+        attempts = [(BEAM, steps), (4 * BEAM, steps)]
         if self.repairs and self.before is not None:
-            attempts = [(REPAIR_BEAM, min(REPAIR_STEPS, self.steps_left))]
-        for width, steps in attempts:
-            plans = self.search.plan(robots, poses, steps=steps, width=width)
+            attempts = [(REPAIR_BEAM, min(REPAIR_STEPS, steps))]
+        for width, most in attempts:
+            plans = self.search.plan(robots, poses, steps=most, width=width)
             for robot, (actions, planned, _) in zip(robots, plans, strict=True):
-                self.actions[robot], self.planned[robot] = actions, planned
+                end = self.step + len(actions)
+                self.actions[robot, self.step : end] = actions
+                self.planned[robot, self.step : end] = planned
+                self.actions[robot, end:], self.planned[robot, end:] = STAND, np.nan
             failed = np.array([not reached for _, _, reached in plans])
             robots, poses = robots[failed], poses[failed]
             if not robots.size:
@@ -96,22 +112,24 @@ class Oracle:
 
 
 class _Beam(NamedTuple):
-    """The poses [P] that the search continues from; all have taken equally many steps."""
+    """The poses that the search continues from, `P` for each of N robots, best first.
 
-    robot: Ints
-    """Whose they are."""
+    All have taken equally many steps. Rows of equal length make the search fast; those of a robot
+    with fewer poses are filled up with what is not valid.
+    """
+
     parent: Ints
-    """Where in the beam before they came from."""
-    action: Ints
-    """What led here; `STAND` at the start."""
+    """[N, P] where in the row before they came from."""
+    action: NDArray[np.int8]
+    """[N, P] what led here; `STAND` at the start."""
     pose: Floats
-    """[P, 3] x, y, m, and heading, rad."""
+    """[3, N, P] x, y, m, and heading, rad."""
     turns: Ints
-    """Turns made so far, to the left less those to the right: the heading, without rounding."""
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> _Beam:
-        """Copies of some of them, by number or by mask."""
-        return _Beam._make(each[index] for each in self)
+    """[N, P] turns to the left since the start, less whole circles: the heading unrounded."""
+    cell: Ints
+    """[N, P] number of the cell: row times columns plus column."""
+    valid: NDArray[np.bool_]
+    """[N, P]."""
 
 
 class BeamSearch:
@@ -129,6 +147,7 @@ class BeamSearch:
         self.turn = config.turn_rate * config.time_step
         if min(self.forward, self.backward, self.turn) <= 0:
             raise ValueError("the robot cannot move or turn, expected speeds above 0")
+        self.headings = max(1, round(2 * np.pi / self.turn))
         self.goal_radius = float(env_params.goal_radius)
         self.resolution = occupancy_map.resolution
         self.free = traversable(occupancy_map.occupied, self.resolution, config.robot_radius)
@@ -154,82 +173,135 @@ class BeamSearch:
             For each robot its actions [S], the poses [S, 3] before each of them, and whether they
             lead to the goal; if not, they lead to the best place within `steps`.
         """
-        zeros = np.zeros(len(robots), np.int64)
-        beam = _Beam(np.arange(len(robots)), zeros, zeros, poses, zeros)
-        beams, alive = [beam], beam.robot
-        ends = np.zeros((len(robots), 2), np.int64)
-        reached = np.zeros(len(robots), bool)
-        for depth in range(1, steps + 1):
-            following = self._expand(beam.take(alive), alive)
-            before = beam.pose[following.parent]
-            following = following.take(
-                self._allowed(robots[following.robot], before, following.action)
+        parts = np.array_split(np.arange(len(robots)), -(-len(robots) // ROBOTS_AT_ONCE))
+        with ThreadPoolExecutor(os.cpu_count()) as threads:  # NumPy lets others run meanwhile.
+            plans = threads.map(
+                lambda part: self._plan_some(robots[part], poses[part], steps, width), parts
             )
-            owner, pose = robots[following.robot], following.pose
-            left = self.paths.steps_left(owner, pose, self.forward, self.backward)
-            # The tenth of a millimeter is for the simulator's single precision.
-            inside = np.hypot(*(pose[:, :2] - self.goals[owner]).T) < self.goal_radius - 1e-4
-            left[inside] = -1.0
-            best = self._select(following, left, width)
-            beam = following.take(best)
-            beams.append(beam)
-            # The best pose of each robot comes first.
-            own, first = np.unique(beam.robot, return_index=True)
-            ends[own] = np.stack([np.full(len(own), depth), first], axis=-1)
-            reached[own] = inside[best][first]
-            alive = np.flatnonzero(~reached[beam.robot])
-            if not alive.size:
+            return [plan for of_part in plans for plan in of_part]
+
+    def _plan_some(
+        self, robots: Ints, poses: Floats, steps: int, width: int
+    ) -> list[tuple[Ints, Floats, bool]]:
+        """`plan` for few enough robots that their beams stay in the processor's caches."""
+        beam = self._start(poses)
+        searching = np.arange(len(robots))  # Whose rows the beam has.
+        beams = [(searching, beam)]
+        reached = np.zeros(len(robots), bool)
+        for _ in range(steps):
+            following = self._expand(beam, robots[searching])
+            left, inside = self._steps_left(following, robots[searching])
+            best, valid = self._select(following, left, width)
+            rows = np.arange(len(searching))[:, None]
+            beam = _Beam._make(each[..., rows, best] for each in following)._replace(valid=valid)
+            beams.append((searching, beam))
+            arrived = inside[rows[:, 0], best[:, 0]]
+            reached[searching[arrived]] = True
+            if arrived.all():
                 break
+            if arrived.any():
+                searching = searching[~arrived]
+                beam = _Beam._make(
+                    each[:, ~arrived] if each.ndim == 3 else each[~arrived] for each in beam
+                )
         return [
-            (*_trace_back(beams, int(depth), int(index)), bool(is_there))
-            for (depth, index), is_there in zip(ends, reached, strict=True)
+            (*_trace_back(beams, robot), bool(is_there)) for robot, is_there in enumerate(reached)
         ]
 
-    def _expand(self, beam: _Beam, numbers: Ints) -> _Beam:
+    def _start(self, poses: Floats) -> _Beam:
+        zeros = np.zeros((len(poses), 1), np.int64)
+        return _Beam(
+            parent=zeros,
+            action=zeros.astype(np.int8),
+            pose=poses.T[..., None],
+            turns=zeros,
+            cell=self.paths.cells_of(poses.T[:2, :, None]),
+            valid=zeros == 0,
+        )
+
+    def _expand(self, beam: _Beam, robots: Ints) -> _Beam:
         """All poses one step on from those of a beam; no step straight back.
 
         Args:
             beam: where to go on from.
-            numbers: [P] what its poses are called as parents.
+            robots: [N] which of the goals its robots have.
         """
-        beam = beam._replace(parent=numbers)
-        parts = []
-        for action in (FORWARD, BACKWARD, LEFT, RIGHT):
-            part = beam.take(beam.action != INVERSE[action])
-            if action in (FORWARD, BACKWARD):
-                step = self.forward if action == FORWARD else -self.backward
-                part = part.take(self.is_clear(part.pose, step))
-                heading = part.pose[:, 2]
-                part.pose[:, 0] += step * np.cos(heading)
-                part.pose[:, 1] += step * np.sin(heading)
-            else:
-                sign = 1 if action == LEFT else -1
-                part.pose[:, 2] = wrap_angle(part.pose[:, 2] + sign * self.turn)
-                part.turns[:] += sign
-            part.action[:] = action
-            parts.append(part)
-        return _Beam._make(np.concatenate(each) for each in zip(*parts, strict=True))
+        num_robots, width = beam.cell.shape
+        heading = beam.pose[2]
+        shape = (num_robots, len(MOVES), width)
+        valid = beam.valid[:, None] & (beam.action[:, None] != INVERSE[MOVES, None])
+        pose: Floats = np.broadcast_to(beam.pose[:, :, None], (3, *shape)).copy()
+        turns, cell = (
+            np.broadcast_to(each[:, None], shape).copy() for each in (beam.turns, beam.cell)
+        )
+        cosine, sine = np.cos(heading), np.sin(heading)
+        for number, step in enumerate((self.forward, -self.backward)):
+            pose[0, :, number] += step * cosine
+            pose[1, :, number] += step * sine
+            ahead = cosine * np.sign(step), sine * np.sign(step)
+            tried = valid[:, number]
+            tried &= self._is_clear(beam.pose[0], beam.pose[1], *ahead, abs(step), tried)
+            reached = self.paths.cells_of(pose[:2, :, number])
+            cell[:, number] = np.where(tried, reached, beam.cell)
+        for number, sign in ((2, 1), (3, -1)):
+            pose[2, :, number] = wrapped_once(heading + sign * self.turn)
+            turns[:, number] = (beam.turns + sign) % self.headings
+        for robot, refused_at, action in self.refused:
+            row = np.flatnonzero(robots == robot)
+            same = _is_at(np.moveaxis(beam.pose[:, row], 0, -1), refused_at)
+            valid[row, MOVES.index(action)] &= ~same
+        everyone = (num_robots, len(MOVES) * width)
+        return _Beam(
+            parent=np.broadcast_to(np.tile(np.arange(width), len(MOVES)), everyone),
+            action=np.broadcast_to(np.repeat(np.array(MOVES, np.int8), width), everyone),
+            pose=pose.reshape(3, *everyone),
+            turns=turns.reshape(everyone),
+            cell=cell.reshape(everyone),
+            valid=valid.reshape(everyone),
+        )
 
-    def _allowed(self, robots: Ints, before: Floats, action: Ints) -> NDArray[np.bool_]:
-        """Which of the moves [N] were not refused before."""
-        allowed = np.ones(len(robots), dtype=bool)
-        for robot, pose, refused in self.refused:
-            same = np.flatnonzero((robots == robot) & (action == refused))
-            allowed[same[_is_at(before[same], pose)]] = False
-        return allowed
+    def _steps_left(self, beam: _Beam, robots: Ints) -> tuple[Floats, NDArray[np.bool_]]:
+        """Estimated steps to the goal, less than all others at the goal, and who is there."""
+        robots = robots[:, None]
+        left = self.paths.steps_left_in(beam.cell, robots, beam.pose, self.forward, self.backward)
+        goals = self.goals[robots]
+        away = np.hypot(beam.pose[0] - goals[..., 0], beam.pose[1] - goals[..., 1])
+        # The tenth of a millimeter is for the simulator's single precision.
+        inside = beam.valid & (away < self.goal_radius - 1e-4)
+        left[inside] = -1.0
+        return left, inside
 
-    def _select(self, beam: _Beam, left: Floats, width: int) -> NDArray[np.intp]:
-        """The `width` best poses of each robot, best first, one for each cell and heading."""
-        headings = max(1, round(2 * np.pi / self.turn))
-        col, row = np.floor(beam.pose[:, :2] / self.resolution).astype(np.int64).T
-        cell = row * self.free.shape[1] + col
-        state = (beam.robot * self.free.size + cell) * headings + beam.turns % headings
-        order = np.lexsort((left, beam.robot))
-        first = np.sort(np.unique(state[order], return_index=True)[1])
-        order = order[first]
-        owner = beam.robot[order]
-        rank = np.arange(len(order)) - np.searchsorted(owner, owner)
-        return order[rank < width]
+    def _select(
+        self, beam: _Beam, left: Floats, width: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The `width` best poses of each robot, best first, one for each cell and heading.
+
+        Integers are sorted in which the number of a pose stands last: several times faster than to
+        sort numbers by the values of others.
+
+        Returns:
+            [N, P] where they are in the rows, and which of them are valid.
+        """
+        count = left.shape[1]
+        bits = count.bit_length()
+        last, places = (1 << bits) - 1, np.arange(count)
+        most = np.fmin(left, LARGEST_ESTIMATE)
+        fine = 2.0 ** (62 - bits) / (max(most.max(), 1.0) + 2.0)
+        key = (((most + 1.0) * fine).astype(np.int64) << bits) + places
+        key[~beam.valid] = NOWHERE
+        key.sort(axis=1)
+        valid = key != NOWHERE
+        order = np.where(valid, key & last, 0)
+        state = np.take_along_axis(beam.cell * self.headings + beam.turns, order, axis=1)
+        key = (state << bits) + places
+        key[~valid] = NOWHERE
+        key.sort(axis=1)
+        rank = key & last
+        rank[:, 1:][key[:, 1:] >> bits == key[:, :-1] >> bits] = last
+        rank.sort(axis=1)
+        rank = rank[:, :width]
+        valid = rank < last
+        return np.take_along_axis(order, np.where(valid, rank, 0), axis=1), valid
 
     def is_clear(self, pose: Floats, distance: float) -> NDArray[np.bool_]:
         """Whether a straight move of `distance` m (< 0 is backward) from poses [N, 3] is allowed.
@@ -237,19 +309,33 @@ class BeamSearch:
         Slightly stricter: two lines, `SIDE_MARGIN` to the left and right, must not meet a cell that
         is not free, and neither must the next millimeter.
         """
-        direction = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1) * np.sign(distance)
-        length = abs(distance) + 1e-3
-        col, row = (
-            np.floor((pose[:, :2] + direction * (length / 2)) / self.resolution).astype(int).T
-        )
-        row = np.clip(row, 0, self.free.shape[0] - 1)
-        col = np.clip(col, 0, self.free.shape[1] - 1)
-        clear = self.clearance[row, col] > length / 2 + SIDE_MARGIN
-        near = np.flatnonzero(~clear)
-        start, ahead = pose[near, :2], direction[near]
+        x, y, heading = pose.T
+        ahead = np.cos(heading) * np.sign(distance), np.sin(heading) * np.sign(distance)
+        return self._is_clear(x, y, *ahead, abs(distance), np.ones(len(pose), bool))
+
+    def _is_clear(
+        self,
+        x: Floats,
+        y: Floats,
+        ahead_x: Floats,
+        ahead_y: Floats,
+        distance: float,
+        tried: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """`is_clear` from places, m, along unit vectors, arrays of any shape; where it is tried."""
+        length = distance + 1e-3
+        height, width = self.free.shape
+        col = np.floor((x + ahead_x * (length / 2)) / self.resolution).astype(np.int64)
+        row = np.floor((y + ahead_y * (length / 2)) / self.resolution).astype(np.int64)
+        middle = np.clip(row, 0, height - 1) * width + np.clip(col, 0, width - 1)
+        clear = self.clearance.reshape(-1)[middle] > length / 2 + SIDE_MARGIN
+        near = np.nonzero(tried & ~clear)
+        start = np.stack([x[near], y[near]], axis=-1)
+        ahead = np.stack([ahead_x[near], ahead_y[near]], axis=-1)
         aside = SIDE_MARGIN * np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
-        clear[near] = self._line_is_free(start + aside, ahead * length)
-        clear[near] &= self._line_is_free(start - aside, ahead * length)
+        free = self._line_is_free(start + aside, ahead * length)
+        free[free] = self._line_is_free((start - aside)[free], ahead[free] * length)
+        clear[near] = free
         return clear
 
     def _line_is_free(self, start: Floats, line: Floats) -> NDArray[np.bool_]:
@@ -277,18 +363,25 @@ class BeamSearch:
         return np.asarray((self.free[row, col] | empty).all(axis=1))
 
 
-def _is_at(pose: Floats, planned: Floats) -> Any:
-    """Whether poses [..., 3] are a planned one [3]."""
+def _is_at(pose: Floats, planned: NDArray[np.floating]) -> Any:
+    """Whether poses [..., 3] are the planned ones [..., 3]."""
     away = pose - planned
     away[..., 2] = wrap_angle(away[..., 2])
     return np.abs(away).max(axis=-1) < ON_PLAN
 
 
-def _trace_back(beams: list[_Beam], depth: int, index: int) -> tuple[Ints, Floats]:
-    """Actions and the poses before them that led to one pose of a beam."""
-    actions, poses = [], []
-    for beam, before in zip(beams[depth:0:-1], beams[:depth][::-1], strict=True):
-        actions.append(beam.action[index])
-        index = beam.parent[index]
-        poses.append(before.pose[index])
+def _trace_back(beams: list[tuple[Ints, _Beam]], robot: int) -> tuple[Ints, Floats]:
+    """Actions of a robot, and the poses before them, that led to its best pose at last.
+
+    Args:
+        beams: for each step whose rows the beam has, ascending, and the beam.
+        robot: whose actions.
+    """
+    last = next(i for i in range(len(beams) - 1, -1, -1) if robot in beams[i][0])
+    actions, poses, index = [], [], 0
+    for step in range(last, 0, -1):
+        row, row_before = (np.searchsorted(beams[i][0], robot) for i in (step, step - 1))
+        actions.append(beams[step][1].action[row, index])
+        index = beams[step][1].parent[row, index]
+        poses.append(beams[step - 1][1].pose[:, row_before, index])
     return np.array(actions[::-1], np.int64), np.array(poses[::-1]).reshape(-1, 3)

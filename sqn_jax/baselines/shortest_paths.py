@@ -81,10 +81,9 @@ class ShortestPaths:
             for i, j in MOVES
             for clear in [clear_moves(free, i, j)[rows, cols]]
         ]
-        size = (len(np.unique(goals, axis=0)), len(rows))
-        self.length = np.empty(size, np.float32)
-        self.direction = np.empty(size, np.float32)
-        self.bends = np.empty(size, np.float32)
+        # What is known of a cell lies together: it is looked up together.
+        self._table = np.empty((len(np.unique(goals, axis=0)), len(rows), 3), np.float32)
+        self.length, self.direction, self.bends = np.moveaxis(self._table, -1, 0)
         for number, (same, field) in enumerate(goal_fields(free, resolution, goals)):
             self.which[same] = number
             self.length[number] = field[rows, cols]
@@ -127,14 +126,37 @@ class ShortestPaths:
         self, robots: NDArray[np.int64], pose: NDArray[np.float64], forward: float, backward: float
     ) -> NDArray[np.float64]:
         """Estimated steps from poses [N, 3] to the goals of robots [N]."""
-        col, row = np.floor(pose[:, :2] / self.resolution).astype(np.int64).T
-        cell, field = self.index[row, col], self.which[robots]
-        direction = self.direction[field, cell].astype(np.float64)
-        away = pose[:, :2] - self.centers[cell]
+        return self.steps_left_in(self.cells_of(pose.T[:2]), robots, pose.T, forward, backward)
+
+    def cells_of(self, place: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The cells of places [2, ...], m: row times columns plus column."""
+        col, row = np.floor(place / self.resolution).astype(np.int64)
+        return np.asarray(row * len(self.index[0]) + col)
+
+    def steps_left_in(
+        self,
+        cell: NDArray[np.int64],
+        robots: NDArray[np.int64],
+        pose: NDArray[np.float64],
+        forward: float,
+        backward: float,
+    ) -> NDArray[np.float64]:
+        """`steps_left` from poses [3, ...] whose cells are known."""
+        free_cell = self.index.reshape(-1)[cell]
+        ahead = self._table.reshape(-1, 3)[self.which[robots] * len(self.centers) + free_cell]
+        length, direction, bends = np.moveaxis(ahead, -1, 0).astype(np.float64)
+        row, col = np.divmod(cell, len(self.index[0]))
         # From the cell's center to the place itself.
-        length = self.length[field, cell] - (
-            away[:, 0] * np.cos(direction) + away[:, 1] * np.sin(direction)
-        )
-        off = np.abs(wrap_angle(pose[:, 2] - direction)) / self.turn
+        away_x = pose[0] - (col + 0.5) * self.resolution
+        away_y = pose[1] - (row + 0.5) * self.resolution
+        length -= away_x * np.cos(direction) + away_y * np.sin(direction)
+        off = np.abs(wrapped_once(pose[2] - direction)) / self.turn
         in_reverse = np.pi / self.turn - off + np.maximum(length, 0) * (1 / backward - 1 / forward)
-        return length / forward + np.minimum(off, in_reverse) + self.bends[field, cell]
+        return length / forward + np.minimum(off, in_reverse) + bends
+
+
+def wrapped_once(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`wrap_angle` of angles within one turn of its range, to the bit; division takes longer."""
+    angle = angle + math.pi
+    angle = np.where(angle >= 2 * math.pi, angle - 2 * math.pi, angle)
+    return np.where(angle < 0, angle + 2 * math.pi, angle) - math.pi

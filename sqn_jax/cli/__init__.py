@@ -1,5 +1,5 @@
-"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn map check`,
-`sqn tasks`.
+"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn export`,
+`sqn map check`, `sqn tasks`.
 
 It only passes arguments to functions.
 
@@ -11,6 +11,7 @@ something to save, it is saved first. If not, the signal itself ends the process
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import sys
@@ -21,6 +22,7 @@ from typing import NoReturn
 
 from sqn_jax import __version__
 from sqn_jax.cli.evaluate import evaluate
+from sqn_jax.cli.export import export
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
 from sqn_jax.cli.tasks import tasks
@@ -34,6 +36,7 @@ _SUMMARIES = {
     "evaluate RUN ...": "compare trained robots and baselines on any maps, with noise",
     "report RUN ...": "the same as a page with pictures, the worst episodes first",
     "render RUN ...": "animations and pictures of what trained robots do on a map",
+    "export POLICY": "write a trained robot's policy for its computer: ONNX, or NumPy alone",
     "map check FILE": "describe a map, or say what is wrong with it",
     "tasks ACTION": "make or check a suite of tasks, on public benchmarks or fresh maps",
 }
@@ -56,6 +59,9 @@ def run() -> NoReturn:
     """
     end_at_once()
     streams.install()
+    # What JAX traces is a million objects that stay: to look through them for garbage as often as
+    # Python does by default takes a tenth of the time of a start.
+    gc.set_threshold(50_000, 20, 100)
     code = main()
     failure = streams.failure()
     if failure is not None and code == 0:
@@ -129,6 +135,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "evaluate": evaluate,
     "report": report,
     "render": render,
+    "export": export,
     "map": check_map,
     "tasks": tasks,
 }

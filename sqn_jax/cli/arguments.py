@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
@@ -80,6 +80,47 @@ def tasks(argument: str) -> str:
         return argument
     known = ", ".join(TASKS)
     raise argparse.ArgumentTypeError(f"is {argument!r}, expected {known} or a file ending in .json")
+
+
+def suite_file(names: Sequence[str], given: Mapping[str, object]) -> Path | None:
+    """The file of tasks among the values of --tasks, if there is one.
+
+    Args:
+        names: the values.
+        given: options that the file has a say in, and their values; false where not given.
+
+    Raises:
+        ValueError: a file and something else, or an option that the file replaces.
+    """
+    files = [name for name in names if name not in TASKS]
+    if not files:
+        return None
+    if len(names) > 1:
+        raise ValueError(f"--tasks {' '.join(names)}: expected one file alone")
+    for option, value in given.items():
+        if value:
+            raise ValueError(f"{option}: not with --tasks {files[0]}, where the file says it")
+    return Path(files[0])
+
+
+def add_epsilon(parser: argparse.ArgumentParser) -> None:
+    """Add the option --epsilon with one value."""
+    parser.add_argument(
+        "--epsilon",
+        type=number,
+        default=0.0,
+        metavar="E",
+        help="probability of a random action in each step (default 0: greedy)",
+    )
+
+
+def pick(argument: str) -> int | Literal["worst"]:
+    """A task of a suite by its number, or worst."""
+    if argument == "worst":
+        return "worst"
+    if argument.isascii() and argument.isdigit() and len(argument) < 10:
+        return int(argument)
+    raise argparse.ArgumentTypeError(f"is {argument!r}, expected the number of a task or worst")
 
 
 def checkpoint(argument: str) -> int | str:

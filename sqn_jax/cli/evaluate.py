@@ -17,6 +17,7 @@ from sqn_jax.cli.arguments import (
     integer,
     number,
     single_maps,
+    suite_file,
     tasks,
 )
 from sqn_jax.config.presets import PAPER_MAPS
@@ -34,16 +35,16 @@ def evaluate(arguments: list[str]) -> int:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
     from sqn_jax.training import devices
 
-    suite_file = _suite_file(options)
+    tasks_file = _suite_file(options)
     devices.require(options.device)
     if options.out is None:
         streams.require_output("--out FILE for the results")
     else:
         _require_writable(options.out)
-    if suite_file is None:
+    if tasks_file is None:
         _evaluate_drawn_tasks(options)
     else:
-        _evaluate_suite(options, suite_file)
+        _evaluate_suite(options, tasks_file)
     if options.out is not None:
         say(f"wrote {options.out} and {options.out.with_suffix('.jsonl')}")
     return 0
@@ -51,11 +52,6 @@ def evaluate(arguments: list[str]) -> int:
 
 def _suite_file(options: argparse.Namespace) -> Path | None:
     """The file of tasks, if one is asked for."""
-    files = [name for name in options.tasks if name not in TASKS]
-    if not files:
-        return None
-    if len(options.tasks) > 1:
-        raise ValueError(f"--tasks {' '.join(options.tasks)}: expected one file alone")
     of_the_file = {
         "--maps": options.maps,
         "--max-steps": options.max_steps,
@@ -63,10 +59,7 @@ def _suite_file(options: argparse.Namespace) -> Path | None:
         "--noise-unit": options.noise_unit,
         "--robot-radius": options.robot_radius is not None,
     }
-    for option, value in of_the_file.items():
-        if value:
-            raise ValueError(f"{option}: not with --tasks {files[0]}, where the file says it")
-    return Path(files[0])
+    return suite_file(options.tasks, of_the_file)
 
 
 def _agents(options: argparse.Namespace) -> list[Agent]:
@@ -80,7 +73,7 @@ def _agents(options: argparse.Namespace) -> list[Agent]:
 
 
 def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
-    from sqn_jax.evaluation.scores import results_table
+    from sqn_jax.evaluation.scores import results_table, table_note
     from sqn_jax.evaluation.settings import Settings
     from sqn_jax.runs.evaluate import evaluate_session
 
@@ -99,7 +92,9 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
         robot_radius=options.robot_radius,
     )
     evaluation = evaluate_session(_agents(options), settings, options.out)
-    say_lines(results_table(evaluation["results"]).split("\n"))
+    say_lines(
+        [*results_table(evaluation["results"]).split("\n"), table_note(evaluation["results"])]
+    )
     for comparison in evaluation["comparisons"]:
         low, high = comparison["ci95"]
         say(
@@ -111,7 +106,7 @@ def _evaluate_drawn_tasks(options: argparse.Namespace) -> None:
 
 def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
     from sqn_jax.evaluation.settings import SuiteSettings
-    from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table
+    from sqn_jax.evaluation.suite_scores import comparison_lines, suite_table, table_notes
     from sqn_jax.runs.evaluate import evaluate_suite_session
     from sqn_jax.tasks import read_suite
 
@@ -129,7 +124,8 @@ def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
         noise=(sum(options.velocity_noise), sum(options.range_noise)),
     )
     evaluation, _ = evaluate_suite_session(_agents(options), suite, settings, options.out, file)
-    say_lines([*suite_table(evaluation).split("\n"), *comparison_lines(evaluation)])
+    table, notes = suite_table(evaluation).split("\n"), table_notes(evaluation)
+    say_lines([*table, *notes, *comparison_lines(evaluation)])
 
 
 def _parser() -> Parser:

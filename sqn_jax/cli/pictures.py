@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
+from typing import Any
 
 from sqn_jax.cli.arguments import (
     CACHE,
@@ -10,11 +12,16 @@ from sqn_jax.cli.arguments import (
     Parser,
     add_checkpoint,
     add_device,
+    add_epsilon,
     add_no_baselines,
+    add_params,
     folder,
     integer,
     number,
+    pick,
     single_maps,
+    suite_file,
+    tasks,
 )
 from sqn_jax.outside.messages import say
 
@@ -23,7 +30,7 @@ def report(arguments: list[str]) -> int:
     """Write a report."""
     parser = Parser(
         prog="sqn report",
-        description="Run greedy episodes of trained policies and write one page about them: "
+        description="Run episodes of trained policies and write one page about them: "
         "the worst episodes, success and time steps, curves, paths, an animation, settings.",
         epilog=CACHE,
         allow_abbrev=False,
@@ -42,8 +49,10 @@ def report(arguments: list[str]) -> int:
     add("--episodes", type=integer, default=100, help="per evaluation seed (default 100)")
     add("--eval-seeds", type=integer, default=1, help="number of evaluation seeds (default 1)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
+    add_epsilon(parser)
     add_no_baselines(parser)
     add_checkpoint(parser)
+    add_params(parser)
     add_device(parser)
     add("--out", type=Path, default=Path("report.html"), help="default: report.html")
     options = parser.parse_args(arguments)
@@ -60,7 +69,7 @@ def report(arguments: list[str]) -> int:
 
     devices.require(options.device)
     reports.require_writable(options.out)
-    runs = reports.read_runs(options.runs, options.checkpoint)
+    runs = reports.read_runs(options.runs, options.checkpoint, options.params)
     config = runs[0].policy.config
     maps = options.maps or [str(config.maps.names[0])]
     settings = Settings(
@@ -71,7 +80,9 @@ def report(arguments: list[str]) -> int:
         seed=options.seed,
         goal_radii=(config.env.goal_radius,),
     )
-    reports.write_report(runs, settings, options.out, baselines=not options.no_baselines)
+    reports.write_report(
+        runs, settings, options.out, baselines=not options.no_baselines, epsilon=options.epsilon
+    )
     say(f"wrote {options.out}")
     return 0
 
@@ -80,23 +91,39 @@ def render(arguments: list[str]) -> int:
     """Write pictures and animations."""
     parser = Parser(
         prog="sqn render",
-        description="Run greedy episodes of trained policies on a map and draw them: animations "
+        description="Run episodes of trained policies on a map and draw them: animations "
         "(GIF), the paths of all policies side by side, and timelines.",
         epilog=CACHE,
         allow_abbrev=False,
     )
     add = parser.add_argument
     add("runs", nargs="*", metavar="RUN", help="run folders, pretrained:NAME or files NAME.npz")
-    add("--map", default="maze", help="a name or a file (default maze)")
-    add("--episodes", type=integer, default=4, help="per policy (default 4)")
-    add("--tasks", choices=list(TASKS), default="points", help="default: points")
+    add("--map", help="a name or a file (default maze)")
+    add("--episodes", type=integer, help="per policy (default 4)")
+    add(
+        "--tasks",
+        type=tasks,
+        default="points",
+        help="points or pairs (default: points), or a file of tasks, see sqn tasks",
+    )
+    add(
+        "--pick",
+        nargs="+",
+        type=pick,
+        default=[],
+        metavar="TASK",
+        help="of a file of tasks those of these numbers, from 0 as in the records of sqn evaluate, "
+        "or worst: those with the least success in one try each (default: the first)",
+    )
     add("--animations", type=integer, default=1, help="animations per policy (default 1)")
     add("--seed", type=integer, default=1_000, help="the evaluation seed (default 1000)")
     add("--velocity-noise", type=number, default=0.0, metavar="S", help="e.g. 0.1")
     add("--range-noise", type=number, default=0.0, metavar="P", help="e.g. 0.2")
     add("--max-steps", type=integer, default=0, help="steps per episode (default: the map's limit)")
     add("--mp4", action="store_true", help="also write MP4 files; needs sqn_jax[video]")
+    add_epsilon(parser)
     add_checkpoint(parser)
+    add_params(parser)
     add_device(parser)
     add("--out", type=folder, metavar="DIR", help="default: renders/RUN_MAP")
     options = parser.parse_args(arguments)
@@ -115,17 +142,41 @@ def render(arguments: list[str]) -> int:
     for name in options.runs:
         if options.runs.count(name) > 1:
             raise ValueError(f"{name}: comes twice, expected each run once")
-    policies = [find_policy(name, options.checkpoint) for name in options.runs]
-    renders.render_session(
-        policies,
-        options.out or renders.default_folder(policies, options.map),
-        map_name=options.map,
-        tasks=TASKS[options.tasks],
-        episodes=options.episodes,
-        animations=options.animations,
-        seed=options.seed,
-        noise=(options.velocity_noise, options.range_noise),
-        max_steps=options.max_steps,
-        mp4=options.mp4,
-    )
+    suite_name = _suite_to_draw(options)
+    policies = [find_policy(name, options.checkpoint, options.params) for name in options.runs]
+    map_name = options.map or "maze"
+    folder_of_pictures = options.out or renders.default_folder(policies, map_name, suite_name)
+    how: dict[str, Any] = {
+        "animations": options.animations,
+        "seed": options.seed,
+        "noise": (options.velocity_noise, options.range_noise),
+        "epsilon": options.epsilon,
+        "mp4": options.mp4,
+    }
+    if options.episodes is not None:
+        how["episodes"] = options.episodes
+    if suite_name is None:
+        how |= {"map_name": map_name, "tasks": TASKS[options.tasks]}
+        renders.render_session(policies, folder_of_pictures, max_steps=options.max_steps, **how)
+        return 0
+    from sqn_jax.report.render_suite import render_suite_session
+    from sqn_jax.tasks import read_suite
+
+    chosen: Any = "worst" if options.pick == ["worst"] else options.pick
+    suite = read_suite(suite_name)
+    render_suite_session(policies, suite, folder_of_pictures, source=suite_name, pick=chosen, **how)
     return 0
+
+
+def _suite_to_draw(options: argparse.Namespace) -> Path | None:
+    """The file of tasks, if one is asked for; its options are checked."""
+    given = {"--map": options.map is not None, "--max-steps": options.max_steps}
+    file = suite_file([options.tasks], given)
+    text = " ".join(map(str, options.pick))
+    if file is None and options.pick:
+        raise ValueError(f"--pick {text}: only with --tasks FILE.json")
+    if "worst" in options.pick and len(options.pick) > 1:
+        raise ValueError(f"--pick {text}: expected worst alone, or numbers of tasks")
+    if options.episodes is not None and options.pick and options.pick != ["worst"]:
+        raise ValueError(f"--episodes: not with --pick {text}, which says how many")
+    return file

@@ -24,8 +24,9 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def to_public_dict(config: TrainConfig) -> dict[str, Any]:
-    """`to_dict` for a file that others read: of a run it started from the name, not the place."""
-    return to_dict(config) | {"start_from": Path(config.start_from).name}
+    """`to_dict` for a file that others read: of files and of a run the name, not the place."""
+    maps = str(config.maps.without_folders())
+    return to_dict(config) | {"start_from": Path(config.start_from).name, "map": maps}
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -50,7 +50,7 @@ class EnvConfig:
     """Steps an episode; 0 takes the map's own limit (400, in the cave 1200)."""
     coverage_cell: float = 0.325
     """Distance of the points on which the covered area is counted, m."""
-    ray_sectors: int = 32
+    ray_sectors: int = 8
     """Directions in the free-space table of the ray caster; a multiple of 4."""
     ray_iterations: int = 8
     """Free rectangles a ray may cross before its reading is cut short."""
@@ -266,12 +266,16 @@ class ExplorationConfig:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """The evaluation that follows a training run."""
+    """The evaluations of a training run: at its end, and at points of its learning curve."""
 
     episodes: int = 100
     """Greedy episodes from the evaluation points, and as many from random spawn pairs."""
     seed: int = 1_000
     """Seed of the starts and goals; independent of the training seed."""
+    curve_points: int = 20
+    """How often, evenly over the run, the policy is evaluated while it is trained; 0: never."""
+    curve_episodes: int = 100
+    """Greedy episodes from the evaluation points at each such time, the same at all."""
 
     def __post_init__(self) -> None:
         require_within_limits(self, "eval")

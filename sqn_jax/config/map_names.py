@@ -17,8 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-KINDS = ("maze", "column", "forest", "cave")
-"""Kinds of procedural maps."""
+KINDS = (
+    *("maze", "column", "forest", "cave"),
+    *("rooms", "corridors", "track", "clutter", "courtyard"),
+)
+"""Kinds of procedural maps; what is drawn from a seed may count on their order."""
 
 MAX_SEED = 999_999_999
 
@@ -169,6 +172,14 @@ class MapSet:
             for name in self.names
         )
         return MapSet(names, self.weights)
+
+    def without_folders(self) -> MapSet:
+        """The same with the names alone for files; as it is where two of them would be the same."""
+        names = tuple(
+            MapFile(Path(name.path).name, name.resolution) if isinstance(name, MapFile) else name
+            for name in self.names
+        )
+        return MapSet(names, self.weights) if len(set(names)) == len(names) else self
 
     def _parts(self, *, stems: bool = False) -> Iterator[str]:
         runs: list[tuple[MapName, MapName, int]] = []  # First, last, weight.

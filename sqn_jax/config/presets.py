@@ -77,7 +77,7 @@ def _smoke() -> TrainConfig:
             restart_at_goal=True,
         ),
         exploration=ExplorationConfig(epsilon_start=0.5, epsilon_end=0.05, ladder=True),
-        eval=EvalConfig(episodes=8),
+        eval=EvalConfig(episodes=8, curve_points=1, curve_episodes=8),
     )
 
 

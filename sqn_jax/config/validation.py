@@ -48,6 +48,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "eval.episodes": (1, 100_000),  # More would not fit into memory.
     "eval.seeds": (1, 10_000),
     "eval.seed": (0, 2**31 - 1),
+    "eval.curve_points": (0, 1_000_000),
+    "eval.curve_episodes": (1, 100_000),
     "seed": (0, 2**31 - 1),
     "num_seeds": (1, 10_000),
 }

@@ -83,9 +83,9 @@ class Lattice:
             width=width_m,
             cell=cell,
             max_range=max_range,
-            origin=(-left, -bottom),
-            num_bitmasks=math.ceil(columns / 32),
-            num_groups=math.ceil(rows / group_rows),
+            origin=(-left, group_rows - bottom),
+            num_bitmasks=max(math.ceil(columns / 32), 2),
+            num_groups=math.ceil(rows / group_rows) + 2,
         )
 
     @property
@@ -97,11 +97,6 @@ class Lattice:
     def shape(self) -> tuple[int, int, int]:
         """Shape of a `covered` array."""
         return self.num_bitmasks, self.num_groups, self.group_rows
-
-    @property
-    def stride(self) -> int:
-        """Bitmasks are numbered group by group; one number between two groups stands for none."""
-        return self.num_bitmasks + 1
 
     def points(self) -> NDArray[np.float64]:
         """Places of all points on the map, [bitmasks, groups, group_rows, 32, 2] x m, y m."""
@@ -160,13 +155,19 @@ def add_scan(
         The new coverage, and the newly seen area in m2.
     """
     u, v = _turn(pose[0] / lattice.cell, pose[1] / lattice.cell)
-    u, v = u + lattice.origin[0], v + lattice.origin[1]
+    # Rows are counted from the first that a scan on the map can reach.
+    u, v = u + lattice.origin[0], v + (lattice.origin[1] - lattice.group_rows)
     sectors = _sectors(pose[2] - LATTICE_ANGLE, ranges / lattice.cell, field_of_view)
-    seen = _place(*_draw(u, v, sectors, lattice), lattice) & lattice.on_map()
-    fresh = jax.lax.population_count(seen & ~covered).astype(jnp.float32)
-    # A product with ones: the CPU adds up a row so faster than by a reduction.
-    counts = fresh @ jnp.ones(lattice.group_rows)
-    return covered | seen, counts.sum() * lattice.cell**2
+    radius = lattice.max_range / lattice.cell
+    rows = jnp.floor(v) + np.arange(1 - lattice.group_rows, lattice.group_rows + 1.0)
+    num_bitmasks = math.ceil(2 * radius / ROW_BITS)
+    first_points = jnp.ceil(u - radius) + ROW_BITS * np.arange(num_bitmasks)
+    bitmasks = _draw(rows - v, first_points - u, sectors)
+    num_fresh = jnp.int32(0)
+    for first_point, seen in zip(first_points, bitmasks, strict=True):
+        covered, fresh = _mark(covered, rows, first_point, seen, lattice)
+        num_fresh += fresh
+    return covered, num_fresh.astype(jnp.float32) * lattice.cell**2
 
 
 def _turn(x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
@@ -236,51 +237,36 @@ def _sector_at(angle: Array, num_beams: int, field_of_view: float) -> Array:
     return to_integer(jnp.where(jnp.abs(wrapped) > field_of_view / 2, float(num_beams), beam))
 
 
-def _draw(u: Array, v: Array, sectors: Array, lattice: Lattice) -> tuple[Array, Array, list[Array]]:
-    """Draw the sectors [4, S] around a robot at (u, v) cells.
+def _draw(rows: Array, starts: Array, sectors: Array) -> list[Array]:
+    """Draw the sectors [4, S] around a robot.
 
-    Rows above and rows below the robot are each in the order of a group of the lattice, so that a
-    row's place on the map needs no look-up, only the right group.
+    Args:
+        rows: [2 R] rows in reach, half of them below the robot, counted from it, cells.
+        starts: [W] first points of the bitmasks, counted from the robot, cells.
+        sectors: from `_sectors`.
 
     Returns:
-        For W bitmasks of `ROW_BITS` points of each row in reach: which bitmask of the lattice,
-        counted with `stride`, the first point falls into [W, 2, group_rows] int32; which bit of it
-        [W] uint32; and the points that are seen, W times [2, group_rows] uint32.
+        The points that are seen, W times [2 R] uint32, `ROW_BITS` in each.
     """
-    radius = lattice.max_range / lattice.cell
-    places = jnp.arange(lattice.group_rows, dtype=jnp.float32)
-    lowest = jnp.floor(v) + 1
-    above = lowest + lattice.group_rows * fraction((places - lowest) / lattice.group_rows)
-    rows = jnp.floor(above[None] + np.array([[0.5], [0.5 - lattice.group_rows]], np.float32))
-    own_groups = jnp.floor((rows + 0.5) / lattice.group_rows)
-    num_bitmasks = math.ceil(2 * radius / ROW_BITS)
-    first_points = jnp.ceil(u - radius) + ROW_BITS * np.arange(num_bitmasks, dtype=np.float32)
-    own_bitmasks = jnp.floor(first_points / 32)
-    on_map = (own_bitmasks >= -1) & (own_bitmasks < lattice.num_bitmasks)
-    numbers = own_bitmasks[:, None, None] + lattice.stride * own_groups[None]
-    numbers = to_integer(jnp.where(on_map[:, None, None], numbers, -9.0))
-
     num_blocks = math.ceil(sectors.shape[1] / LARGEST_BLOCK)
     block = math.ceil(sectors.shape[1] / num_blocks)
     missing = num_blocks * block - sectors.shape[1]
     sectors = jnp.pad(sectors, ((0, 0), (0, missing)), constant_values=-1.0)
+    halves = rows.reshape(2, -1)[::-1]
     # From the point half a cell before the first, so that rounding a place to the next whole number
     # counts the points before it.
-    draw = partial(_draw_block, rows=rows - v, starts=first_points - 0.5 - u, block=block)
+    draw = partial(_draw_block, rows=halves, starts=starts - 0.5, block=block)
     # The first sector above the robot begins at the far right, the first one below at the left.
-    begin = jnp.broadcast_to(np.array([[FAR], [-FAR]], np.float32), rows.shape)
-    nothing = [jnp.zeros(rows.shape, jnp.uint32)] * num_bitmasks
+    begin = jnp.broadcast_to(np.array([[FAR], [-FAR]], np.float32), halves.shape)
+    nothing = [jnp.zeros(halves.shape, jnp.uint32)] * len(starts)
 
     def draw_next(index: Array | int, carry: Any) -> Any:
-        begin, bitmasks, _ = carry
         part = jax.lax.dynamic_slice_in_dim(sectors, index * block, block, axis=1)
-        # What comes out of a loop is not merged into what follows and computed there once more for
-        # each bitmask of the map; so the numbers come out of it, too.
-        return *draw(begin, bitmasks, part), numbers
+        begin, bitmasks = carry
+        return draw(begin, bitmasks, part)
 
-    start = (begin, nothing, jnp.zeros_like(numbers))
-    _, bitmasks, numbers = repeat(num_blocks, draw_next, start, unroll=1)
-    return numbers, to_integer(first_points - 32 * own_bitmasks).astype(jnp.uint32), bitmasks
+    _, bitmasks = repeat(num_blocks, draw_next, (begin, nothing), unroll=1)
+    return [bitmask[::-1].reshape(-1) for bitmask in bitmasks]
 
 
 def _draw_block(
@@ -291,8 +277,9 @@ def _draw_block(
     for sector in range(block):
         end = rows * sectors[:2, sector, None]
         left, right = smaller(begin, end), larger(begin, end)
+        # Beyond the circle the chord is 0: right of the left end and left of the right one.
         chord_squared = sectors[2:, sector, None] - squares
-        chord = jnp.where(chord_squared < 0, -FAR, jnp.sqrt(larger(chord_squared, 0.0)))
+        chord = jnp.sqrt(larger(chord_squared, 0.0))
         right = smaller(right, chord)
         left = smaller(larger(left, -chord), right)
         bitmasks = [
@@ -310,17 +297,32 @@ def _power(number: Array) -> Array:
     return jnp.uint32(1) << (to_integer(clipped).astype(jnp.uint32) & 31)
 
 
-def _place(numbers: Array, bits: Array, bitmasks: list[Array], lattice: Lattice) -> Array:
-    """The drawn bitmasks where they belong on the map, and nothing seen around them."""
-    bitmask, group = np.ogrid[: lattice.num_bitmasks, : lattice.num_groups]
-    own_number = (bitmask + group * lattice.stride).astype(np.int32)[..., None]
-    seen = jnp.zeros(lattice.shape, jnp.uint32)
-    for index, points in enumerate(bitmasks):
-        lower = points << bits[index]
-        # Upwards in two steps: by 32 at once, where nothing is left over, is no shift.
-        upper = points >> 1 >> (31 - bits[index])
-        for half in (0, 1):
-            number = jnp.expand_dims(numbers[index, half], (0, 1))
-            rest = jnp.where(own_number == number + 1, upper[half][None, None], jnp.uint32(0))
-            seen |= jnp.where(own_number == number, lower[half][None, None], rest)
-    return seen
+def _mark(
+    covered: Array, rows: Array, first_point: Array, seen: Array, lattice: Lattice
+) -> tuple[Array, Array]:
+    """Mark the points seen of a bitmask from `first_point` on in each of the rows, [2 R] both.
+
+    Only a window of the map is read and written, in place: two bitmasks wide, since a drawn one
+    seldom begins where one of the map does, and as high as a scan. Rows always lie in the array,
+    bitmasks at the map's edge may not, and the window stays inside.
+
+    Returns:
+        The new coverage, and how many points are new.
+    """
+    column = jnp.floor(first_point / 32)
+    bit = to_integer(first_point - 32 * column).astype(jnp.uint32)
+    # Upwards in two steps: by 32 at once, where nothing is left over, is no shift.
+    lower, upper = seen << bit, seen >> 1 >> (31 - bit)
+    own_column = smaller(larger(column, 0.0), lattice.num_bitmasks - 2.0)
+    columns = own_column + np.arange(2, dtype=np.float32)[:, None]
+    nothing = jnp.uint32(0)
+    seen = jnp.where(columns == column, lower[None], nothing)
+    seen |= jnp.where(columns == column + 1, upper[None], nothing)
+    corner = (to_integer(own_column), to_integer(rows[0]) + lattice.group_rows)
+    on_map = jnp.asarray(lattice.on_map().reshape(lattice.num_bitmasks, -1))
+    flat = covered.reshape(on_map.shape)
+    seen &= jax.lax.dynamic_slice(on_map, corner, seen.shape)
+    before = jax.lax.dynamic_slice(flat, corner, seen.shape)
+    after = jax.lax.dynamic_update_slice(flat, before | seen, corner)
+    num_fresh = jax.lax.population_count(seen & ~before).astype(jnp.int32).sum()
+    return after.reshape(covered.shape), num_fresh

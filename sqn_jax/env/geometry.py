@@ -15,6 +15,8 @@ from sqn_jax.config import EnvConfig
 Angle = TypeVar("Angle", float, Array, NDArray[Any])
 """rad, a number or an array of JAX or of NumPy."""
 
+AnyArray = TypeVar("AnyArray", Array, NDArray[Any])
+
 
 def wrap_angle(angle: Angle) -> Angle:
     """Return the angle folded into [-pi, pi), rad, of any shape."""
@@ -53,11 +55,21 @@ def encode_distance(distance: Array, config: EnvConfig) -> Array:
     return distance / (distance + config.goal_distance_scale)
 
 
-def decode_distance(encoded: NDArray[Any], config: EnvConfig) -> NDArray[Any]:
-    """The inverse of `encode_distance`, m; "clipped" shows no more than `max_goal_distance`."""
+def decode_goal(goal: AnyArray, config: EnvConfig) -> tuple[AnyArray, AnyArray]:
+    """Distance, m, and heading, rad, from the goal as an agent sees it, [..., 2 or 3].
+
+    The inverse of what `navigation.observe` does, for NumPy arrays, too; a distance beyond
+    `farthest_shown` comes back as that.
+    """
+    xp: Any = jnp if isinstance(goal, Array) else np
+    shown = goal[..., 0]
     if config.goal_distance_encoding == "clipped":
-        return encoded * config.max_goal_distance
-    return config.goal_distance_scale * encoded / np.maximum(1 - encoded, 2.0**-24)
+        distance = shown * config.max_goal_distance
+    else:
+        distance = config.goal_distance_scale * shown / xp.maximum(1 - shown, 2.0**-24)
+    if config.heading_encoding == "linear":
+        return distance, goal[..., 1] * 2 * np.pi - np.pi
+    return distance, xp.arctan2(goal[..., 1] * 2 - 1, goal[..., 2] * 2 - 1)
 
 
 def farthest_shown(config: EnvConfig) -> float:

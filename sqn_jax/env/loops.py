@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TypeVar
 
 import jax
@@ -20,7 +19,6 @@ def repeat(
     On a CPU the compiler repeats what passes written out one after the other have in common, and on
     a GPU each pass of a loop is a few kernels that take longer to start than to run.
     """
-    looped = partial(jax.lax.fori_loop, 0, count, body, unroll=unroll)
-    written_out = partial(jax.lax.fori_loop, 0, count, body, unroll=True)
-    result: Carry = jax.lax.platform_dependent(start, cuda=written_out, default=looped)
+    on_gpu = jax.default_backend() == "gpu"
+    result: Carry = jax.lax.fori_loop(0, count, body, start, unroll=on_gpu or unroll)
     return result

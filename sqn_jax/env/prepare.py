@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,7 @@ from sqn_jax.env.params import EnvParams
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
     MAX_CELLS,
+    MAX_CELLS_TOGETHER,
     OccupancyMap,
     cells_to_points,
     connected_components,
@@ -96,16 +98,7 @@ def make_env(
         spawn_groups=jnp.asarray(groups, jnp.int32),
         spawn_neighbors=jnp.asarray(_nearest(middles, groups), jnp.int32),
         near_goal_fraction=jnp.float32(config.near_goal_fraction),
-        commands=jnp.array(
-            [
-                [0.0, 0.0],
-                [config.forward_speed, 0.0],
-                [-config.backward_speed, 0.0],
-                [0.0, config.turn_rate],
-                [0.0, -config.turn_rate],
-            ],
-            jnp.float32,
-        ),
+        commands=jnp.asarray(commands_of(config)),
         time_step=jnp.float32(config.time_step),
         goal_radius=jnp.float32(config.goal_radius),
         velocity_noise=_velocity_noise(config),
@@ -121,13 +114,26 @@ def make_env(
     )
 
 
+def commands_of(config: EnvConfig) -> NDArray[np.float32]:
+    """[5, 2] forward speed m/s and turn rate rad/s of each action of `env.ACTION_NAMES`."""
+    commands = [
+        [0.0, 0.0],
+        [config.forward_speed, 0.0],
+        [-config.backward_speed, 0.0],
+        [0.0, config.turn_rate],
+        [0.0, -config.turn_rate],
+    ]
+    return np.array(commands, np.float32)
+
+
 def _require_size(occupancy_map: OccupancyMap, config: EnvConfig) -> None:
     """Refuse maps that would take minutes and gigabytes to prepare."""
     name, (height, width) = occupancy_map.name, occupancy_map.shape
-    if height * width > MAX_CELLS:
+    most = MAX_CELLS_TOGETHER if occupancy_map.parts else MAX_CELLS
+    if height * width > most:
         instead = "fewer maps" if occupancy_map.parts else "coarser ones"
         raise ValueError(
-            f"map {name}: {width} x {height} cells, expected at most {MAX_CELLS:,}: {instead}"
+            f"map {name}: {width} x {height} cells, expected at most {most:,}: {instead}"
         )
     width_m, height_m = occupancy_map.tile_m
     points = (width_m + 1) * (height_m + 1) / config.coverage_cell**2
@@ -190,21 +196,29 @@ def _velocity_noise(config: EnvConfig) -> Array:
 def _ray_grid(
     blocked: NDArray[np.bool_], resolution: float, sectors: int, reach_m: float
 ) -> RayGrid:
-    reach = min(math.ceil(reach_m / resolution), 127)  # What a signed byte holds.
+    # A rectangle is up to a cell longer; a signed byte holds 127.
+    reach = min(math.ceil(reach_m / resolution), 126)
     height, width = blocked.shape
     if sectors * height * width >= 2**31 or 128 * width > LARGEST_INTEGER:
         raise ValueError(
             f"the map has {height} x {width} cells, expected fewer than {2**31 // sectors:,} "
             f"with env.ray_sectors {sectors}"
         )
-    sides = far_sides(free_rectangles(blocked, sectors, reach))
     return RayGrid(
-        far_sides=jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1)),
+        far_sides=_table(blocked.tobytes(), blocked.shape, sectors, reach),
         first_entry=jnp.int32(0),
         resolution=jnp.float32(resolution),
         width=jnp.int32(width),
         sectors=sectors,
     )
+
+
+@lru_cache(maxsize=2)
+def _table(blocked: bytes, shape: tuple[int, int], sectors: int, reach: int) -> Array:
+    """The table of a `RayGrid`; those of the last map are kept, for its other kinds of tasks."""
+    cells = np.frombuffer(blocked, np.bool_).reshape(shape)
+    sides = far_sides(free_rectangles(cells, sectors, reach))
+    return jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1))
 
 
 def _groups(parts: NDArray[np.int64]) -> NDArray[np.int64]:

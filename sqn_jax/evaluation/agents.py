@@ -113,12 +113,8 @@ class TrainedAgent:
         fields: Sequence[str],
         on_batch: OnBatch,
     ) -> list[list[EpisodeResults]]:
-        keys = [
-            episodes.episode_keys(task_key(seed, world.tasks), settings.episodes)
-            for seed in eval_seeds
-        ]
         of_policies = episodes.run_seeds(
-            jnp.concatenate(keys),
+            _keys(eval_seeds, world, settings),
             self.stacked_params(),
             world.env_params,
             self.network,
@@ -127,9 +123,10 @@ class TrainedAgent:
             fields=fields,
             on_batch=on_batch,
         )
-        first = [index * settings.episodes for index in range(len(eval_seeds))]
-        own = [slice(start, start + settings.episodes) for start in first]
-        return [[results.of_episodes(chosen) for results in of_policies] for chosen in own]
+        return [
+            [results.of_episodes(own) for results in of_policies]
+            for own in _of_seeds(eval_seeds, settings)
+        ]
 
 
 @dataclass(frozen=True)
@@ -140,6 +137,17 @@ class BaselineAgent:
     env_config: EnvConfig
     training_seeds: Sequence[int | None] = (None,)
     epsilon: float = 0.0
+    navigator: baseline_episodes.Navigator | None = None
+    """That of `at_work`, for some episodes of a world."""
+
+    def at_work(self, eval_seeds: Sequence[int], world: World, settings: Settings) -> BaselineAgent:
+        """The same agent; the oracle already plans what `run` with these arguments will need."""
+        if self.name != "oracle":
+            return self
+        navigator = baseline_episodes.oracle_ahead(
+            _keys(eval_seeds, world, settings), world.occupancy_map, world.env_params
+        )
+        return dataclasses.replace(self, navigator=navigator)
 
     @property
     def algorithm(self) -> str:
@@ -153,35 +161,36 @@ class BaselineAgent:
         fields: Sequence[str],
         on_batch: OnBatch,
     ) -> list[list[EpisodeResults]]:
-        return [
-            [self._run_seed(eval_seed, world, settings, fields, on_batch)]
-            for eval_seed in eval_seeds
-        ]
-
-    def _run_seed(
-        self,
-        eval_seed: int,
-        world: World,
-        settings: Settings,
-        fields: Sequence[str],
-        on_batch: OnBatch,
-    ) -> EpisodeResults:
-        if self.name == "oracle":
-            choose = baseline_episodes.oracle(world.occupancy_map, world.env_params)
+        if self.navigator is not None:
+            navigator = self.navigator
+        elif self.name == "oracle":
+            navigator = baseline_episodes.oracle(world.occupancy_map, world.env_params)
         else:
-            choose = baseline_episodes.bug(world.env_params, settings.episodes)
-        needed = tuple(dict.fromkeys(("poses", "goals", *fields)))
+            navigator = baseline_episodes.bug(world.env_params.config)
         metrics, trajectory = baseline_episodes.run_baseline(
-            episodes.episode_keys(task_key(eval_seed, world.tasks), settings.episodes),
-            choose,
+            _keys(eval_seeds, world, settings),
+            navigator,
             world.env_params,
             goal_radii=settings.goal_radii,
-            fields=needed,
+            fields=tuple(dict.fromkeys(("poses", "goals", *fields))),
+            on_batch=on_batch,
         )
-        on_batch(settings.episodes)
         # A copy, or the starts would keep all poses in memory.
         starts = np.array(trajectory.poses[0])
-        return EpisodeResults(metrics, starts, trajectory.goals, trajectory.only(*fields))
+        results = EpisodeResults(metrics, starts, trajectory.goals, trajectory.only(*fields))
+        return [[results.of_episodes(own)] for own in _of_seeds(eval_seeds, settings)]
+
+
+def _keys(eval_seeds: Sequence[int], world: World, settings: Settings) -> jax.Array:
+    """The keys of the episodes of all evaluation seeds, one seed after the other."""
+    of_seeds = [task_key(seed, world.tasks) for seed in eval_seeds]
+    return jnp.concatenate([episodes.episode_keys(key, settings.episodes) for key in of_seeds])
+
+
+def _of_seeds(eval_seeds: Sequence[int], settings: Settings) -> list[slice]:
+    """Where among these episodes those of each evaluation seed are."""
+    firsts = [index * settings.episodes for index in range(len(eval_seeds))]
+    return [slice(first, first + settings.episodes) for first in firsts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +217,18 @@ class EpisodeBatch:
     def main_metrics(self) -> EpisodeMetrics:
         """The metrics for the first goal radius."""
         return next(iter(self.metrics.values()))
+
+    @property
+    def routes(self) -> NDArray[np.int64]:
+        """[E] numbers that are equal for tasks from and to the same two points of the map."""
+        occupancy_map = self.world.occupancy_map
+        is_evaluation = self.world.tasks == "evaluation points"
+        points = occupancy_map.evaluation_points if is_evaluation else occupancy_map.spawn_points
+        nearest = [
+            np.linalg.norm(places[:, None, :2] - points, axis=-1).argmin(axis=1)
+            for places in (self.starts, self.goals)
+        ]
+        return np.asarray(nearest[0] * len(points) + nearest[1], np.int64)
 
     def numbers(self, goal_radius: float) -> dict[str, NDArray[np.float64]]:
         """The numbers of each episode, [E] each, by the names that they have in the files."""
@@ -242,6 +263,7 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
             checkpoint_minutes=1.0,
             checkpoint_replay=True,
             max_skipped_updates=0,
+            eval=dataclasses.replace(policy.config.eval, curve_points=0, curve_episodes=1),
         )
         pools.setdefault(without_seed, []).append(policy)
     algorithms = [config.algo for config in pools]

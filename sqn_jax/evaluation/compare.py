@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sqn_jax.baselines.shortest_paths import has_paths, require_paths, shortest_path_lengths
 from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
-from sqn_jax.evaluation.agents import Agent, EpisodeBatch, OnBatch, TrainedAgent
+from sqn_jax.evaluation.agents import Agent, BaselineAgent, EpisodeBatch, OnBatch, TrainedAgent
+from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.training import memory_budget
@@ -170,8 +171,12 @@ def evaluate_agents(
             memory_budget.bound_programs()
             actors = [agent for agent in agents if robots[agent.name] == robot]
             evaluated: dict[str, list[EpisodeBatch]] = {agent.name: [] for agent in actors}
+            # First of all the oracle begins to plan: the others run meanwhile.
+            running = {
+                agent.name: _results(agent, world, settings, needed, on_batch) for agent in actors
+            }
             for agent in actors:
-                for batch in _batches(agent, world, settings, paths, on_batch, needed):
+                for batch in _batches(agent, world, settings, paths, running[agent.name]):
                     if on_evaluated is not None:
                         on_evaluated(batch)
                     # The steps of many episodes would fill the memory; statistics need none.
@@ -196,29 +201,43 @@ def evaluate_agents(
     return {"schema": 1, "std_ddof": 1, "results": results, "comparisons": comparisons}, records
 
 
+def _blocks(settings: Settings) -> list[list[int]]:
+    """The evaluation seeds, as many together as are run at once."""
+    eval_seeds = settings.all_eval_seeds
+    at_once = max(1, EPISODES_AT_ONCE // settings.episodes)
+    return [eval_seeds[first : first + at_once] for first in range(0, len(eval_seeds), at_once)]
+
+
+def _results(
+    agent: Agent, world: World, settings: Settings, fields: Sequence[str], on_batch: OnBatch
+) -> Iterator[tuple[list[int], list[list[EpisodeResults]]]]:
+    """The results of an agent, as many evaluation seeds at once; a baseline is at work at once."""
+    blocks = _blocks(settings)
+    first: Agent = agent
+    if isinstance(agent, BaselineAgent):
+        first = agent.at_work(blocks[0], world, settings)
+    runners = [first, *[agent] * (len(blocks) - 1)]
+    return (
+        (block, runner.run(block, world, settings, fields, on_batch))
+        for block, runner in zip(blocks, runners, strict=True)
+    )
+
+
 def _batches(
     agent: Agent,
     world: World,
     settings: Settings,
     paths: dict[bytes, NDArray[np.float64] | None],
-    on_batch: OnBatch,
-    fields: Sequence[str],
+    of_blocks: Iterable[tuple[list[int], list[list[EpisodeResults]]]],
 ) -> Iterator[EpisodeBatch]:
     """The episodes of all training seeds under all evaluation seeds.
 
     `paths` caches the lengths of the shortest paths, m, by task; None where they are not searched.
     """
-    robot_radius = world.env_params.config.robot_radius
-    eval_seeds = settings.all_eval_seeds
-    at_once = max(1, EPISODES_AT_ONCE // settings.episodes)
-    for first in range(0, len(eval_seeds), at_once):
-        block = eval_seeds[first : first + at_once]
-        results = agent.run(block, world, settings, fields, on_batch)
-        of_seeds = zip(product(block, agent.training_seeds), chain(*results), strict=True)
+    for block, results in of_blocks:
+        of_seeds = list(zip(product(block, agent.training_seeds), chain(*results), strict=True))
+        _search_paths(paths, world, [(starts, goals) for _, (_, starts, goals, _) in of_seeds])
         for (eval_seed, training_seed), (metrics, starts, goals, trajectory) in of_seeds:
-            tasks = world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
-            if tasks not in paths:
-                paths[tasks] = _shortest_paths(world.occupancy_map, starts, goals, robot_radius)
             yield EpisodeBatch(
                 agent=agent,
                 world=world,
@@ -227,9 +246,31 @@ def _batches(
                 metrics=dict(zip(settings.goal_radii, metrics, strict=True)),
                 starts=starts,
                 goals=goals,
-                shortest_paths=paths[tasks],
+                shortest_paths=paths[_task_name(world, starts, goals)],
                 trajectory=trajectory,
             )
+
+
+def _task_name(world: World, starts: Floats, goals: Floats) -> bytes:
+    return world.occupancy_map.name.encode() + starts.tobytes() + goals.tobytes()
+
+
+def _search_paths(
+    paths: dict[bytes, NDArray[np.float64] | None],
+    world: World,
+    tasks: Sequence[tuple[Floats, Floats]],
+) -> None:
+    """Add the shortest paths of tasks that are not there yet, all goals of a map at once."""
+    new = {_task_name(world, *task): task for task in tasks}
+    new = {name: task for name, task in new.items() if name not in paths}
+    if not new:
+        return
+    starts, goals = (np.concatenate(each) for each in zip(*new.values(), strict=True))
+    robot_radius = world.env_params.config.robot_radius
+    lengths = _shortest_paths(world.occupancy_map, starts, goals, robot_radius)
+    ends = np.cumsum([len(own_goals) for _, own_goals in new.values()])
+    split = [None] * len(new) if lengths is None else np.split(lengths, ends[:-1])
+    paths.update(zip(new, split, strict=True))
 
 
 def _shortest_paths(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqn_jax.config import Algorithm
+from sqn_jax.config import Algorithm, TrainConfig
 from sqn_jax.config.presets import PAPER_MAPS
 
 _TABLE: dict[Algorithm, tuple[tuple[float, float], ...]] = {
@@ -18,3 +18,11 @@ PAPER_RESULTS: dict[str, dict[str, tuple[float, float]]] = {
 """Success and time steps, table I of the paper, by algorithm and the name of our map.
 
 The maps of the paper are not published; ours are similar but not the same."""
+
+PAPER_REWARDS: dict[str, float] = {"sqn": 1.35, "r2d2": 1.18, "dqn": 1.10}
+"""Mean reward a step in evaluation, at the end of training in the maze (paper, section V-A)."""
+
+
+def paper_reward(config: TrainConfig) -> float | None:
+    """The paper's final mean reward to set beside a run; None for a run on another map."""
+    return PAPER_REWARDS[config.algo] if str(config.maps.names[0]) == "maze" else None

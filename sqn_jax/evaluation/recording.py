@@ -286,7 +286,7 @@ def record_episodes(
     _, trajectory = run_episodes(
         keys, params, env_params, agent.network, epsilon=agent.epsilon, fields=RECORDED
     )
-    covered = jax.device_get(_covered(trajectory.poses, env_params))
+    covered = jax.device_get(covered_points(trajectory.poses, env_params))
     trajectory = dataclasses.replace(trajectory, covered=covered)
     return [
         Episode(agent.name, world.occupancy_map, env_params, trajectory.of_robots(index))
@@ -295,6 +295,6 @@ def record_episodes(
 
 
 @jax.jit
-def _covered(poses: Array, env_params: EnvParams) -> Array:
+def covered_points(poses: Array, env_params: EnvParams) -> Array:
     """[T + 1, E, ...] the points covered along poses [T + 1, E, 3]."""
     return jax.vmap(covered_along, in_axes=(1, None), out_axes=1)(poses, env_params)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from sqn_jax.evaluation.agents import EpisodeBatch
 from sqn_jax.evaluation.statistics import (
-    bootstrap_interval,
+    clustered_interval,
     interquartile_mean,
     probability_of_improvement,
     sample_std,
     stratified_bootstrap,
-    wilson_interval,
 )
 from sqn_jax.outside.messages import shown
 
@@ -40,12 +39,13 @@ def describe(
         success), `steps_over_oracle` (steps of a success, divided by the oracle's in the same task;
         None without a success or without an oracle), `spl` (None where shortest paths are unknown),
         `mean_reward`, `collisions`, `coverage_m2`. Each has the `mean`, the `std` over episodes, a
-        95 % interval `ci95` over episodes (Wilson for `success`, bootstrap for the others), and
-        `std_of_means` over the means of the (training seed, evaluation seed) pairs; for one
-        training seed this is the spread in the paper. Both are sample standard deviations (n - 1),
-        None for a single value. With several training seeds there are also `iqm` and `iqm_ci95`,
-        the interquartile mean over them: intervals over episodes do not cover the differences
-        between training seeds.
+        95 % interval `ci95` of the mean, and `std_of_means` over the means of the (training seed,
+        evaluation seed) pairs; for one training seed this is the spread in the paper. Both are
+        sample standard deviations (n - 1), None for a single value. The interval resamples training
+        seeds, pairs of points of the map, and tasks between the same two (`clustered_interval`);
+        `ci95_over` says whether there are several training seeds. If there is one, the interval is
+        over tasks only. With several there are also `iqm` and `iqm_ci95`, the interquartile mean
+        over them.
     """
     metrics = [batch.numbers(goal_radius) for batch in batches]
     result: dict[str, Any] = {}
@@ -54,26 +54,31 @@ def describe(
         values = [metric[name] for metric in metrics if name in metric]
         is_known = len(values) == len(metrics)
         result[name] = _describe(name, values, batches, goal_radius) if is_known else None
-    steps = [metric["time_steps"][metric["success"] > 0] for metric in metrics]
-    result["time_steps_success"] = _over_episodes(np.concatenate(steps))
+    steps = [np.where(metric["success"] > 0, metric["time_steps"], np.nan) for metric in metrics]
+    result["time_steps_success"] = _over_tasks(steps, batches)
     ratios = _steps_over_oracle(batches, goal_radius, oracle or [])
-    result["steps_over_oracle"] = _over_episodes(ratios)
+    result["steps_over_oracle"] = _over_tasks(ratios, batches)
     result["success_per_seed"] = _of_each_seed("success", batches, goal_radius)
+    has_seeds = len(result["success_per_seed"]) > 1
+    result["ci95_over"] = "training seeds and tasks" if has_seeds else "tasks"
     return result
 
 
 def _steps_over_oracle(
     batches: Sequence[EpisodeBatch], goal_radius: float, oracle: Sequence[EpisodeBatch]
-) -> NDArray[np.float64]:
-    """Steps divided by the oracle's, for every task in which both reach the goal."""
+) -> list[NDArray[np.float64]]:
+    """Steps divided by the oracle's; NaN for every task in which one of them misses the goal."""
     oracle_batches = {batch.eval_seed: batch for batch in oracle}
-    ratios = [np.empty(0)]
-    for batch in (batch for batch in batches if batch.eval_seed in oracle_batches):
+    ratios = []
+    for batch in batches:
         ours = batch.numbers(goal_radius)
-        theirs = oracle_batches[batch.eval_seed].numbers(goal_radius)
-        reached = (ours["success"] > 0) & (theirs["success"] > 0)
-        ratios.append(ours["time_steps"][reached] / theirs["time_steps"][reached])
-    return np.concatenate(ratios)
+        ratio = np.full_like(ours["time_steps"], np.nan)
+        if batch.eval_seed in oracle_batches:
+            theirs = oracle_batches[batch.eval_seed].numbers(goal_radius)
+            reached = (ours["success"] > 0) & (theirs["success"] > 0)
+            ratio[reached] = ours["time_steps"][reached] / theirs["time_steps"][reached]
+        ratios.append(ratio)
+    return ratios
 
 
 def _describe(
@@ -82,11 +87,8 @@ def _describe(
     batches: Sequence[EpisodeBatch],
     goal_radius: float,
 ) -> dict[str, Any]:
-    joined = np.concatenate(values)
-    description = _over_episodes(joined)
+    description = _over_tasks(values, batches, is_rate=name == "success")
     assert description is not None
-    if name == "success":
-        description["ci95"] = list(wilson_interval(int(joined.sum()), joined.size))
     description["std_of_means"] = sample_std([value.mean() for value in values])
     scores = _of_each_seed(name, batches, goal_radius)
     if len(scores) > 1:
@@ -103,14 +105,28 @@ def _of_each_seed(name: str, batches: Sequence[EpisodeBatch], goal_radius: float
     return [float(np.concatenate(values).mean()) for values in by_seed.values()]
 
 
-def _over_episodes(values: NDArray[np.float64]) -> dict[str, Any] | None:
-    if values.size == 0:
+def _over_tasks(
+    values: Sequence[NDArray[np.float64]],
+    batches: Sequence[EpisodeBatch],
+    *,
+    is_rate: bool = False,
+) -> dict[str, Any] | None:
+    """Mean, spread and interval of a metric [E] of each batch, NaN left out; None without any."""
+    known = np.concatenate([value[~np.isnan(value)] for value in values])
+    if known.size == 0:
         return None
-    return {
-        "mean": float(values.mean()),
-        "std": sample_std(values),
-        "ci95": list(bootstrap_interval(values)),
-    }
+    training_seeds = list(dict.fromkeys(batch.training_seed for batch in batches))
+    eval_seeds = list(dict.fromkeys(batch.eval_seed for batch in batches))
+    table = np.full((len(training_seeds), len(eval_seeds), len(values[0])), np.nan)
+    routes = np.empty(table.shape[1:], np.int64)
+    for value, batch in zip(values, batches, strict=True):
+        column = eval_seeds.index(batch.eval_seed)
+        table[training_seeds.index(batch.training_seed), column] = value
+        routes[column] = batch.routes
+    interval = clustered_interval(
+        table.reshape(len(training_seeds), -1), is_rate=is_rate, clusters=routes.reshape(-1)
+    )
+    return {"mean": float(known.mean()), "std": sample_std(known), "ci95": list(interval)}
 
 
 def improvement(
@@ -200,6 +216,15 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
         cells += [f"{entry['collisions']['mean']:.1f}", f"{entry['mean_reward']['mean']:.2f}"]
         rows.append(cells)
     return markdown_table(header, rows)
+
+
+def table_note(results: Sequence[dict[str, Any]]) -> str:
+    """What the ± of `results_table` and the intervals of the file are over."""
+    note = "±: over the means of the evaluation seeds"
+    if any(len(entry["training_seeds"]) > 1 for entry in results):
+        note += " of each training seed; 95 % intervals (file): over training seeds and tasks"
+        return f"{note}, of an agent with one training seed over tasks only"
+    return f"{note}; 95 % intervals (file): over tasks only, one training seed"
 
 
 def _row_of(entry: dict[str, Any]) -> tuple[Any, ...]:

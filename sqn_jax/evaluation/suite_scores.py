@@ -119,9 +119,11 @@ def contents(
         `results`: for each agent the `mean` of each of `METRICS` with `ci95` over tasks and
         training seeds and `std_of_tasks`, the sample standard deviation (n - 1) of the means of the
         tasks; `worst_tenth`, the mean success on the tenth of the maps that have the least (at
-        least one map); `maps` and `tasks`, the success and SPL on each. `comparisons`: for each two
-        agents the difference of success and of SPL on the same tasks, see
-        `statistics.paired_comparison`.
+        least one map), which reads too low with few tries, see `statistics.worst_mean`;
+        `worst_tenth_split`, where maps are ranked by every other try and judged by the rest,
+        None with one try of each task; `maps` and `tasks`, the success and SPL on each.
+        `comparisons`: for each two agents the difference of success and of SPL on the same tasks,
+        see `statistics.paired_comparison`.
     """
     maps = [task.map_file for task in suite.tasks]
     compared = ("success", "spl")
@@ -174,6 +176,7 @@ def _describe(table: SuiteTable, maps: Sequence[str]) -> dict[str, Any]:
     }
     on_maps = np.array([of_tasks["success"][chosen].mean() for chosen in of_maps.values()])
     described["worst_tenth"] = statistics.worst_mean(on_maps, WORST_FRACTION)
+    described["worst_tenth_split"] = _split_worst(table.values["success"], list(of_maps.values()))
     described["maps"] = [
         {
             "map": map_file,
@@ -189,6 +192,23 @@ def _describe(table: SuiteTable, maps: Sequence[str]) -> dict[str, Any]:
     return described
 
 
+def _split_worst(
+    success: NDArray[np.float64], of_maps: Sequence[NDArray[np.bool_]]
+) -> float | None:
+    """`statistics.split_worst_mean` of success [S, M, tries]; None with one try."""
+    if success.shape[2] < 2:
+        return None
+    halves = [success[..., first::2].mean(axis=(0, 2)) for first in range(2)]
+    first, second = ([half[chosen].mean() for chosen in of_maps] for half in halves)
+    return statistics.split_worst_mean(first, second, WORST_FRACTION)
+
+
+def worst_tenth(entry: dict[str, Any]) -> float:
+    """The number of a result that tables show: judged by other tries where there are several."""
+    split = entry.get("worst_tenth_split")
+    return float(entry["worst_tenth"] if split is None else split)
+
+
 def suite_table(evaluation: dict[str, Any]) -> str:
     """The results on a suite as a Markdown table: one row for each agent."""
     header = ["agent", "success", "95 % interval", "worst tenth", "SPL", "steps", "collisions"]
@@ -200,13 +220,29 @@ def suite_table(evaluation: dict[str, Any]) -> str:
                 entry["agent"],
                 f"{entry['success']['mean']:.2f}",
                 f"{low:.2f} to {high:.2f}",
-                f"{entry['worst_tenth']:.2f}",
+                f"{worst_tenth(entry):.2f}",
                 f"{entry['spl']['mean']:.2f}",
                 f"{entry['time_steps']['mean']:.0f}",
                 f"{entry['collisions']['mean']:.1f}",
             ]
         )
     return markdown_table(header, rows)
+
+
+def table_notes(evaluation: dict[str, Any]) -> Iterator[str]:
+    """What the interval and the worst tenth of `suite_table` are."""
+    results = evaluation["results"]
+    over = "over tasks only, one training seed"
+    if any(len(entry["training_seeds"]) > 1 for entry in results):
+        over = "over training seeds and tasks, of an agent with one training seed over tasks only"
+    yield f"95 % interval: {over}"
+    if any(entry["worst_tenth_split"] is None for entry in results):
+        yield (
+            "worst tenth: the maps with the least success; with one try of each task bad luck is "
+            "among them, so it reads too low"
+        )
+    else:
+        yield "worst tenth: the maps that are worst in every other try, judged by the rest"
 
 
 def comparison_lines(evaluation: dict[str, Any]) -> Iterator[str]:

@@ -7,8 +7,10 @@ program for all maps, and returns the contents of the evaluation file. It prints
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.baselines.shortest_paths import shortest_path_lengths
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import EnvParams, EnvState, Observation, make_env
+from sqn_jax.env import EnvParams, make_env
 from sqn_jax.env.navigation import STAND
 from sqn_jax.env.prepare import with_noise
 from sqn_jax.env.several_maps import join_maps
@@ -29,6 +32,7 @@ from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.tasks.suite import Task, TaskSuite
 from sqn_jax.training import memory_budget
+from sqn_jax.training.devices import num_cores
 
 LoadMap = Callable[[str], OccupancyMap]
 """Makes a map of `Task.map_file`; the same for the same name."""
@@ -131,9 +135,13 @@ def robot_for(env_config: EnvConfig, suite: TaskSuite) -> EnvConfig:
 
 
 def chunks(
-    suite: TaskSuite, robot: EnvConfig, load: LoadMap, noise: tuple[float, float] = (0.0, 0.0)
+    suite: TaskSuite,
+    robot: EnvConfig,
+    load: LoadMap,
+    noise: tuple[float, float] = (0.0, 0.0),
+    only: Collection[int] | None = None,
 ) -> Iterator[SuiteChunk]:
-    """Prepare the tasks of a suite for a robot, the maps of a chunk at a time.
+    """Prepare the tasks of a suite, or `only` some, for a robot, the maps of a chunk at a time.
 
     All chunks have the same number of steps, and count the covered area on the same lattice, so
     that they share their compiled program.
@@ -142,13 +150,21 @@ def chunks(
     for number, task in enumerate(suite.tasks):
         tasks_of.setdefault(task.map_file, []).append(number)
     sizes = {name: load(name) for name in tasks_of}
-    cells = {name: occupancy_map.occupied.size for name, occupancy_map in sizes.items()}
+    if only is not None:  # The episodes are those of the whole suite: sizes and limits as there.
+        tasks_of = {
+            name: chosen
+            for name, numbers in tasks_of.items()
+            if (chosen := [number for number in numbers if number in only])
+        }
+    cells = {name: sizes[name].occupied.size for name in tasks_of}
     of_maps = [occupancy_map.size_m for occupancy_map in sizes.values()]
     tile_m = (max(width for width, _ in of_maps), max(height for _, height in of_maps))
     max_steps = max(task.max_steps for task in suite.tasks)
     for names in _groups(cells):
         maps = [load(name) for name in names]
-        worlds = [with_noise(make_env(occupancy_map, robot), *noise) for occupancy_map in maps]
+        with ThreadPoolExecutor(num_cores()) as threads:
+            made = threads.map(partial(make_env, config=robot), maps)
+            worlds = [with_noise(world, *noise) for world in made]
         numbers = np.concatenate([tasks_of[name] for name in names])
         which = np.repeat(np.arange(len(names)), [len(tasks_of[name]) for name in names])
         tasks = [suite.tasks[number] for number in numbers]
@@ -225,7 +241,6 @@ def _shortest_paths(
     starts, goals = np.asarray(given.starts, np.float64), np.asarray(given.goals, np.float64)
     for number, occupancy_map in enumerate(maps):
         unknown = np.flatnonzero(np.isnan(lengths) & (np.asarray(given.maps) == number))
-        unknown = np.flatnonzero(np.isnan(lengths) & (given.maps == number))
         if unknown.size:
             lengths[unknown] = shortest_path_lengths(
                 occupancy_map, starts[unknown], goals[unknown], robot_radius=robot_radius
@@ -234,9 +249,13 @@ def _shortest_paths(
 
 
 def run_chunk(
-    agent: Agent, chunk: SuiteChunk, settings: SuiteSettings, on_batch: OnBatch
+    agent: Agent,
+    chunk: SuiteChunk,
+    settings: SuiteSettings,
+    on_batch: OnBatch,
+    fields: Sequence[str] = (),
 ) -> list[EpisodeResults]:
-    """Run an agent on the tasks of a chunk.
+    """Run an agent on the tasks of a chunk; of policies alone `fields` of the trajectory, too.
 
     Returns:
         For each training seed the results of the tries of each task, task by task, [n * tries].
@@ -250,6 +269,7 @@ def run_chunk(
             chunk.joined,
             agent.network,
             epsilon=agent.epsilon,
+            fields=fields,
             on_batch=on_batch,
             tasks=tasks,
             collision_ends=chunk.collision_ends,
@@ -261,9 +281,12 @@ def run_chunk(
         count = batch.stop - first
         chosen = first + np.arange(episodes.BATCH) % count  # The rest of a batch is padding.
         own = jax.tree.map(lambda x, i=chosen: x[i], tasks)
-        choose = _navigator(agent, chunk, own, count)
+        if agent.name == "bug":
+            navigator = baseline_episodes.bug(chunk.joined.config)
+        else:
+            navigator = baseline_episodes.planned(partial(_Oracles, chunk, jax.device_get(own)))
         of_batch = baseline_episodes.run_on_tasks(
-            keys[chosen], choose, chunk.joined, own, collision_ends=chunk.collision_ends
+            keys[chosen], navigator, chunk.joined, own, collision_ends=chunk.collision_ends
         )
         results.append(of_batch.of_episodes(slice(count)))
         on_batch(count)
@@ -283,38 +306,44 @@ def _keys(numbers: jax.Array, settings: SuiteSettings) -> jax.Array:
     return jax.vmap(of_task)(numbers).reshape(-1)
 
 
-def _navigator(
-    agent: BaselineAgent, chunk: SuiteChunk, tasks: GivenTasks, count: int
-) -> baseline_episodes.Choose:
-    """The baseline for the first `count` tasks of a batch; the other robots stand still.
+class _Oracles:
+    """The oracle on several maps: each plans on one. It knows the goal radius of a task."""
 
-    The oracle plans on one map at a time. Either knows the goal radius of its task.
-    """
-    tasks = jax.device_get(tasks)
-    groups: dict[tuple[float, ...], list[int]] = {}
-    for robot in range(count):
-        group: tuple[float, ...] = (float(tasks.goal_radii[robot]),)
-        if agent.name == "oracle":
-            group += (int(tasks.maps[robot]), int(tasks.max_steps[robot]))
-        groups.setdefault(group, []).append(robot)
-    navigators = []
-    for (radius, *own), robots in groups.items():
-        world = chunk.worlds[int(own[0]) if own else 0]
-        config = dataclasses.replace(world.config, goal_radius=radius)
-        world = dataclasses.replace(world, config=config, goal_radius=jnp.float32(radius))
-        if own:
-            world = dataclasses.replace(world, max_steps=int(own[1]))
-            choose = baseline_episodes.oracle(chunk.maps[int(own[0])], world)
-        else:
-            choose = baseline_episodes.bug(world, len(robots))
-        navigators.append((np.array(robots), choose))
+    def __init__(self, chunk: SuiteChunk, tasks: GivenTasks, goals: NDArray[np.float64]) -> None:
+        """Prepare the paths to the goals [E, 2] m of tasks [E]."""
+        self.length, self.step = chunk.joined.max_steps, 0
+        groups: dict[tuple[float, int, int], list[int]] = {}
+        for robot in range(len(goals)):
+            limits = float(tasks.goal_radii[robot]), int(tasks.max_steps[robot])
+            groups.setdefault((*limits, int(tasks.maps[robot])), []).append(robot)
+        self.robots = [np.array(robots) for robots in groups.values()]
+        limits_of_worlds = [
+            (number, {"goal_radius": jnp.float32(radius), "max_steps": max_steps})
+            for radius, max_steps, number in groups
+        ]
+        worlds = [
+            dataclasses.replace(chunk.worlds[number], **limits)
+            for number, limits in limits_of_worlds
+        ]
+        maps = [chunk.maps[number] for *_, number in groups]
+        own_goals = [goals[robots] for robots in self.robots]
+        with ThreadPoolExecutor(num_cores()) as threads:
+            self.oracles = list(threads.map(Oracle, maps, worlds, own_goals))
 
-    def choose_all(obs: Observation, state: EnvState) -> NDArray[np.int64]:
-        obs, state = jax.device_get((obs, state))
-        actions = np.full(len(state.goal), STAND)
-        for robots, choose in navigators:
-            own = jax.tree.map(lambda x, i=robots: x[i], (obs, state))
-            actions[robots] = choose(*own)
+    def choose(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
+        """See `baseline_episodes.Planner`."""
+        actions = np.full(len(poses), STAND)
+        for robots, oracle in zip(self.robots, self.oracles, strict=True):
+            if oracle.step < oracle.max_steps:
+                actions[robots] = oracle.choose(poses[robots])
+        self.step += 1
         return actions
 
-    return choose_all
+    def outlook(self) -> NDArray[np.int8]:
+        """See `baseline_episodes.Planner`."""
+        num_robots = sum(len(robots) for robots in self.robots)
+        actions = np.full((num_robots, self.length - self.step), STAND, np.int8)
+        for robots, oracle in zip(self.robots, self.oracles, strict=True):
+            planned = oracle.outlook()
+            actions[robots, : planned.shape[1]] = planned
+        return actions

@@ -5,6 +5,7 @@ notebook. Animations are made by `frames`, `gif` and `mp4`.
 """
 
 from sqn_jax.figures.animation import frames, gif, mp4
+from sqn_jax.figures.commands import commands
 from sqn_jax.figures.curves import gate_entropy_curves, learning_curve, learning_curves
 from sqn_jax.figures.episode import coverage_example, reachability_example
 from sqn_jax.figures.gallery import map_gallery, map_picture, observation_patterns
@@ -22,6 +23,7 @@ __all__ = [
     "Picture",
     "agents_on_maps",
     "agents_side_by_side",
+    "commands",
     "coverage_example",
     "episode_timeline",
     "frames",

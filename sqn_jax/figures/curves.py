@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.evaluation.statistics import bootstrap_interval
 from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
+from sqn_jax.storage.metrics import evaluated_rows
 
 Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
@@ -44,7 +45,7 @@ def _draw_curve(
     axes.plot(episodes, mean, ms=5, lw=2.0, label=label, **options)
 
 
-def learning_curve(rows: Rows, *, title: str) -> Figure:
+def learning_curve(rows: Rows, *, title: str, paper_reward: float | None = None) -> Figure:
     """Plot reward, success, loss and skill weights of a run over its training episodes.
 
     Args:
@@ -52,8 +53,10 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
             required; `mean_reward`, `success`, `loss`, `epsilon`, `gate_entropy` (nat) and
             `wall_seconds` are drawn if present. Each is a number, or a list of one number per
             training seed: then each seed is a thin line and their mean a bold one. `skill_usage` is
-            [K] or [seeds, K]. NaN and None leave a gap.
+            [K] or [seeds, K]. NaN and None leave a gap. `eval_mean_reward` and `eval_success`, of
+            the greedy policy, are drawn over the rows that have them.
         title: above all panels.
+        paper_reward: the paper's final mean reward, drawn as a line beside `eval_mean_reward`.
 
     Returns:
         Three panels, or four if there are several skills.
@@ -69,8 +72,8 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     lines, columns = (2, 2) if skills > 1 else (1, 3)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
     panels[0].set_title("Mean reward per step", fontsize=11)
-    _draw_curve(panels[0], episodes, _metric(rows, "mean_reward"), COLORS[0])
-    _draw_success(panels[1], episodes, _metric(rows, "success"), _metric(rows, "epsilon"))
+    _draw_reward(panels[0], rows, paper_reward)
+    _draw_success(panels[1], rows)
     _draw_loss(panels[2], episodes, _metric(rows, "loss"))
     if skills > 1:
         usage = _metric(rows, "skill_usage").reshape(len(rows), -1, skills)
@@ -91,12 +94,34 @@ def learning_curve(rows: Rows, *, title: str) -> Figure:
     return figure
 
 
-def _draw_success(axes: Axes, episodes: Floats, success: Floats, epsilon: Floats) -> None:
+def _draw_reward(axes: Axes, rows: Rows, paper_reward: float | None) -> None:
+    """Mean reward while exploring, and that of the greedy policy beside the paper's."""
+    episodes = _metric(rows, "episodes").max(axis=1)
+    _draw_curve(axes, episodes, _metric(rows, "mean_reward"), COLORS[0], "exploring")
+    if _draw_evaluation(axes, rows, "eval_mean_reward"):
+        if paper_reward is not None:
+            axes.axhline(paper_reward, color="0.45", ls=":", lw=1.5, label="the paper's")
+        axes.legend(fontsize=9, loc="best", frameon=False)
+
+
+def _draw_evaluation(axes: Axes, rows: Rows, name: str) -> bool:
+    """Draw a metric of the greedy policy at the points of the learning curve, if there are any."""
+    points = evaluated_rows(rows)
+    if points:
+        episodes, values = _metric(points, "episodes").max(axis=1), _metric(points, name)
+        _draw_curve(axes, episodes, values, COLORS[3], "evaluation")
+    return bool(points)
+
+
+def _draw_success(axes: Axes, rows: Rows) -> None:
     """Success, and the fraction of random actions (epsilon) under which it was measured."""
     axes.set_title("Success while exploring", fontsize=11)
-    _draw_curve(axes, episodes, success, COLORS[2], "success")
+    episodes, epsilon = _metric(rows, "episodes").max(axis=1), _metric(rows, "epsilon")
+    _draw_curve(axes, episodes, _metric(rows, "success"), COLORS[2], "success")
     if np.isfinite(epsilon).any():
         _draw_curve(axes, episodes, epsilon[:, :1], "0.45", "epsilon (random actions)", "--")
+    if _draw_evaluation(axes, rows, "eval_success"):
+        axes.set_title("Success while exploring, and in evaluation", fontsize=11)
     _finish_fractions(axes)
 
 
@@ -125,10 +150,11 @@ def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -
 
 def _finish_fractions(axes: Axes) -> None:
     """A scale from 0 to 1, with space above for the legend."""
-    entries = len(axes.get_legend_handles_labels()[0])
-    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(entries / 3))
+    labels = axes.get_legend_handles_labels()[1]
+    columns = 3 if sum(map(len, labels)) < 40 else 2  # As wide as a panel.
+    axes.set_ylim(-0.02, 1.06 + 0.13 * math.ceil(len(labels) / columns))
     axes.set_yticks(np.linspace(0, 1, 6))
-    axes.legend(fontsize=9, loc="upper center", ncols=3, columnspacing=1.2, frameon=False)
+    axes.legend(fontsize=9, loc="upper center", ncols=columns, columnspacing=1.2, frameon=False)
 
 
 def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
@@ -155,13 +181,23 @@ def _add_minutes(axes: Axes, episodes: Floats, wall_seconds: Floats) -> None:
     top.set_xlabel("minutes", fontsize=9, color="0.35")
 
 
-def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure:
+def learning_curves(
+    runs: Mapping[str, Sequence[Rows]],
+    *,
+    title: str,
+    paper_rewards: Mapping[str, float] | None = None,
+) -> Figure:
     """Plot mean reward and success over the training episodes, one line per agent.
+
+    Where all runs were evaluated while they were trained, those of the greedy policies, as in the
+    paper's figure 6; else those of the robots that explore.
 
     Args:
         runs: for each agent, the rows of `metrics.jsonl` of its runs; `mean_reward` and `success`
-            are numbers, or lists of one per training seed. Runs are cut to the agent's shortest.
+            (or `eval_mean_reward` and `eval_success`) are numbers, or lists of one per training
+            seed. Runs are cut to the agent's shortest.
         title: above both panels.
+        paper_rewards: by agent, the paper's final mean rewards, drawn beside those of evaluation.
 
     Returns:
         Two panels. The line is the mean over the training seeds of an agent, the band its 95 %
@@ -172,17 +208,27 @@ def learning_curves(runs: Mapping[str, Sequence[Rows]], *, title: str) -> Figure
     """
     if not runs:
         raise ValueError("no runs, expected at least one agent")
-    figure = Figure(figsize=(WIDTH_IN, 3.6), dpi=DPI, layout="constrained")
-    panels = figure.subplots(1, 2)
-    for number, (agent, rows_of_runs) in enumerate(runs.items()):
+    for agent, rows_of_runs in runs.items():
         if not rows_of_runs or not all(rows_of_runs):
             raise ValueError(f"agent {agent}: no rows of metrics, expected at least one a run")
+    points = {
+        agent: [evaluated_rows(rows) for rows in of_agent] for agent, of_agent in runs.items()
+    }
+    is_evaluated = all(all(of_agent) for of_agent in points.values())
+    prefix, how = ("eval_", "in evaluation") if is_evaluated else ("", "while exploring")
+    figure = Figure(figsize=(WIDTH_IN, 3.6), dpi=DPI, layout="constrained")
+    panels = figure.subplots(1, 2)
+    for number, (agent, rows_of_runs) in enumerate((points if is_evaluated else runs).items()):
         length = min(len(rows) for rows in rows_of_runs)
         episodes = np.array([row["episodes"] for row in rows_of_runs[0][:length]], float)
         for axes, name in zip(panels, ("mean_reward", "success"), strict=True):
-            values = np.concatenate([_metric(rows[:length], name) for rows in rows_of_runs], axis=1)
+            metrics = [_metric(rows[:length], prefix + name) for rows in rows_of_runs]
+            values = np.concatenate(metrics, axis=1)
             _draw_band(axes, episodes, values, COLORS[number % len(COLORS)], plain(agent))
-    for axes, name in zip(panels, ("Mean reward per step", "Success while exploring"), strict=True):
+        if is_evaluated and paper_rewards and agent in paper_rewards:
+            color, reward = COLORS[number % len(COLORS)], paper_rewards[agent]
+            panels[0].axhline(reward, color=color, ls=":", lw=1.5, label=f"the paper's {agent}")
+    for axes, name in zip(panels, ("Mean reward per step", f"Success {how}"), strict=True):
         axes.set_title(name, fontsize=11)
         axes.set_xlabel("training episodes")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -5,6 +5,7 @@ from sqn_jax.maps.distance import goal_distance, goal_fields, obstacle_distance
 from sqn_jax.maps.load import load_map
 from sqn_jax.maps.occupancy import (
     MAX_CELLS,
+    MAX_CELLS_TOGETHER,
     OccupancyMap,
     cells_to_points,
     connected_components,
@@ -18,6 +19,7 @@ from sqn_jax.maps.ros import known_maps, save_map
 
 __all__ = [
     "MAX_CELLS",
+    "MAX_CELLS_TOGETHER",
     "OccupancyMap",
     "cells_to_points",
     "connected_components",

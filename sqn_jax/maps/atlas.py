@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sqn_jax.maps.occupancy import MAX_CELLS, OccupancyMap, enclose
+from sqn_jax.maps.occupancy import MAX_CELLS_TOGETHER, OccupancyMap, enclose
 
 
 def side_by_side(
@@ -48,10 +48,11 @@ def side_by_side(
     height, width = (max(shape[axis] for shape in shapes) for axis in (0, 1))
     places, count = _places(shapes, (height, width))
     columns, rows = _layout(count)
-    if rows * height * columns * width > MAX_CELLS:
+    if rows * height * columns * width > MAX_CELLS_TOGETHER:
         raise ValueError(
             f"map {name}: {columns * width} x {rows * height} cells of {resolution:g} m, expected "
-            f"at most {MAX_CELLS:,}: fewer maps, or none whose cells are much larger than others'"
+            f"at most {MAX_CELLS_TOGETHER:,}: fewer maps, or none whose cells are much larger than "
+            "others'"
         )
     occupied = np.ones((rows * height, columns * width), dtype=bool)
     spawn, evaluation, parts = [], [], []

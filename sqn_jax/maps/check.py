@@ -8,7 +8,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.maps.distance import MAX_SEARCHED_CELLS, goal_fields, is_searchable
+from sqn_jax.maps.distance import (
+    MAX_SEARCHED_CELLS,
+    goal_fields,
+    grid_path,
+    is_searchable,
+)
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     connected_components,
@@ -130,34 +135,6 @@ def step_warning(
         f"between evaluation points takes at least {steps} steps of {step_length:g} m: no robot "
         "can arrive in time; the key max_steps of the YAML file or an option sets more"
     )
-
-
-def grid_path(
-    free: NDArray[np.bool_], start: NDArray[np.int64], cells: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Steps [P] from a free cell to others [P, 2] along rows and columns; 0 where none leads.
-
-    A wave of cells goes out from the start until it has met the others.
-    """
-    width = free.shape[1] + 2
-    open_cells = np.pad(free, 1).ravel()
-    targets = (cells[:, 0] + 1) * width + cells[:, 1] + 1
-    wave = np.array([(start[0] + 1) * width + start[1] + 1])
-    open_cells[wave] = False
-    steps = np.zeros(len(cells), np.int64)
-    mark = np.zeros(len(open_cells), np.int32)
-    count = 0
-    while len(wave) and open_cells[targets].any():
-        count += 1
-        around = np.concatenate([wave + 1, wave - 1, wave + width, wave - width])
-        around = around[open_cells[around]]
-        # Each cell once: the last to write its number there stays.
-        order = np.arange(len(around), dtype=np.int32)
-        mark[around] = order
-        wave = around[mark[around] == order]
-        open_cells[wave] = False
-        steps[np.isin(targets, wave) & (steps == 0)] = count
-    return steps
 
 
 def _pair_lines(

@@ -23,7 +23,10 @@ SPAWN_COUNT = 16
 EVALUATION_COUNT = 4
 
 MAX_CELLS = 2**24
-"""Cells of a map: the table of free space then takes some minutes and a gigabyte."""
+"""Cells of a map: the table of free space then takes a minute and a gigabyte."""
+
+MAX_CELLS_TOGETHER = 3 * MAX_CELLS
+"""Cells of several maps side by side."""
 
 
 @dataclass(frozen=True, eq=False)

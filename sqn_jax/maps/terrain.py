@@ -90,6 +90,34 @@ def asterisk(
     return where, cells
 
 
+def boxes(
+    size: int,
+    center: ArrayLike,
+    turn: float,
+    sides: Sequence[tuple[float, float, float, float]],
+    margin: float = 0.0,
+) -> Window:
+    """Boxes that turn together about a center: the cells whose centers lie in one.
+
+    Args:
+        size: cells a side.
+        center: (x, y), m.
+        turn: rad, counter-clockwise.
+        sides: of each (left, right, bottom, top) in m from the center, before it is turned.
+        margin: m by which every box is wider on each of its sides.
+    """
+    # As far as the farthest corner of a box around all, which is wider by the margin.
+    reach = math.hypot(*np.abs(np.asarray(sides)).reshape(-1, 2, 2).max(axis=(0, 2)) + margin)
+    where, x, y = _window(size, center, reach)
+    cos, sin = math.cos(turn), math.sin(turn)
+    along, across = x * cos + y * sin, y * cos - x * sin
+    cells = np.zeros(along.shape, dtype=bool)
+    for left, right, bottom, top in sides:
+        inside = (along >= left - margin) & (along <= right + margin)
+        cells |= inside & (across >= bottom - margin) & (across <= top + margin)
+    return where, cells
+
+
 def round_crooks(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A copy with everything filled where no disc of radius 0.16 m fits in.
 
@@ -222,11 +250,13 @@ def spread(cells: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
     Farthest-point sampling, in whole numbers and so the same everywhere.
     """
+    rows, cols = cells.T.copy()
     chosen = [0]
-    nearest = ((cells - cells[0]) ** 2).sum(axis=1)
+    nearest = (rows - rows[0]) ** 2 + (cols - cols[0]) ** 2
     while len(chosen) < count and nearest.max() > 0:
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, ((cells - cells[chosen[-1]]) ** 2).sum(axis=1))
+        last = int(nearest.argmax())
+        chosen.append(last)
+        np.minimum(nearest, (rows - rows[last]) ** 2 + (cols - cols[last]) ** 2, out=nearest)
     return cells[chosen]
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.outside.messages import one_line
 from sqn_jax.outside.reading import read_at_most, read_json
 from sqn_jax.policies.run_policies import Policy, WhichParams, load_policy, require_finite
+from sqn_jax.storage.arrays import MAX_HEADER_BYTES, read_arrays, read_headers
 from sqn_jax.storage.files import write_json, write_whole
 from sqn_jax.training.state import params_shapes
 
@@ -31,9 +31,6 @@ SUFFIX = ".npz"
 
 MAX_JSON_BYTES = 2**20
 """Size of the settings and the model card at most; they have some kilobytes."""
-
-MAX_HEADER_BYTES = 2**12
-"""Size of what stands before the numbers of an array, at most."""
 
 
 def find_policy(
@@ -106,7 +103,7 @@ def read_policy(folder: Path, name: str) -> Policy:
         packed = read_at_most(folder / f"{name}.npz", limit, "the arrays of its network")
         if hashlib.sha256(packed).hexdigest() != description["sha256"]:
             raise ValueError(f"{name}.npz is not the file that {name}.json belongs to")
-        headers = _headers(packed)
+        headers = read_headers(packed)
     except ValueError as error:
         raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
     for path in sorted(expected.keys() | headers.keys()):
@@ -120,12 +117,25 @@ def read_policy(folder: Path, name: str) -> Policy:
                 f"{expected[path].dtype}"
             )
     try:
-        arrays = _arrays(packed, headers)
+        arrays = read_arrays(packed, headers)
     except ValueError as error:
         raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
     params = traverse_util.unflatten_dict(arrays, sep="/")
     require_finite(params, f"policy {name}")
     return Policy(name, config, (jax.tree.map(jnp.asarray, params),))
+
+
+def card_of(name: str) -> dict[str, Any]:
+    """The model card's facts of `pretrained:NAME` or NAME.npz; empty where the file has none.
+
+    Raises:
+        ValueError: the file of its settings is missing or damaged.
+    """
+    own = name.startswith(PREFIX)
+    path = _folder() / f"{name.removeprefix(PREFIX)}{SUFFIX}" if own else Path(name)
+    description = read_json(path.with_suffix(".json"), MAX_JSON_BYTES, "a policy's settings")
+    card = description.get("card", {}) if isinstance(description, dict) else {}
+    return card if isinstance(card, dict) else {}
 
 
 def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index: int = 0) -> None:
@@ -151,53 +161,3 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
 
 def _folder() -> Path:
     return Path(__file__).parent / "weights"
-
-
-def _headers(packed: bytes) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
-    """Shape, dtype and place of the numbers of each array in a .npz file; no number is unpacked.
-
-    Raises:
-        ValueError: it is no such file, holds something else, or an array twice.
-    """
-    headers: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]] = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(packed)) as file:
-            for entry in file.infolist():
-                path = entry.filename.removesuffix(".npy")
-                if path in headers or path == entry.filename:
-                    raise ValueError(f"it holds {entry.filename!r}, expected arrays, each once")
-                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise ValueError(f"{path!r} is compressed in another way than NumPy does")
-                with file.open(entry) as member:
-                    start = io.BytesIO(member.read(MAX_HEADER_BYTES))
-                if np.lib.format.read_magic(start) != (1, 0):
-                    raise ValueError(f"{path!r} is in another version of the format than 1.0")
-                shape, _, dtype = np.lib.format.read_array_header_1_0(start)
-                num_bytes = start.tell() + math.prod(shape) * dtype.itemsize
-                if dtype.hasobject or entry.file_size != num_bytes:
-                    raise ValueError(f"{path!r} is no array of numbers of the size that it states")
-                headers[path] = (shape, dtype, num_bytes)
-    except Exception as error:  # zipfile and NumPy raise a dozen kinds on damaged files.
-        raise ValueError(f"no sound .npz file: {error}") from None
-    return headers
-
-
-def _arrays(
-    packed: bytes, headers: Mapping[str, tuple[tuple[int, ...], np.dtype[Any], int]]
-) -> dict[str, Any]:
-    """The arrays, whose headers are those of the network.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
-    arrays = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(packed)) as file:
-            for path, (_, _, num_bytes) in headers.items():
-                with file.open(f"{path}.npy") as member:
-                    data = member.read(num_bytes)
-                    member.read(1)  # At the end the checksum is compared.
-                arrays[path] = np.load(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # As above.
-        raise ValueError(f"no sound .npz file: {error}") from None
-    return arrays

@@ -102,6 +102,26 @@ def seeds_of(params: Params, config: TrainConfig) -> tuple[Params, ...]:
     return tuple(jax.tree.map(lambda x, i=i: x[i], params) for i in range(config.num_seeds))
 
 
+def of_seed(policy: Policy, seed: int | None) -> Policy:
+    """The policy of one training seed, whose config says it.
+
+    Raises:
+        ValueError: there are several and none is named, or there is no such seed.
+    """
+    seeds = policy.training_seeds
+    if seed is None and len(seeds) > 1:
+        raise ValueError(
+            f"{policy.name}: has the training seeds {seeds[0]} to {seeds[-1]}, expected --seed "
+            "with one of them"
+        )
+    if seed is not None and seed not in seeds:
+        known = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+        raise ValueError(f"{policy.name}: has no training seed {seed}, expected {known}")
+    chosen = seeds[0] if seed is None else seed
+    config = dataclasses.replace(policy.config, seed=chosen, num_seeds=1)
+    return Policy(policy.name, config, (policy.params[seeds.index(chosen)],))
+
+
 def require_same_network(policy: Policy, config: TrainConfig) -> None:
     """Check that a run can start from a policy.
 

@@ -20,7 +20,12 @@ __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 
 @cached_programs()
 def write_report(
-    runs: Sequence[Run], settings: Settings, out: Path, *, baselines: bool = True
+    runs: Sequence[Run],
+    settings: Settings,
+    out: Path,
+    *,
+    baselines: bool = True,
+    epsilon: float = 0.0,
 ) -> None:
     """Evaluate runs with a progress bar and write a page about them.
 
@@ -29,10 +34,11 @@ def write_report(
         settings: of the evaluation; the report is for the first goal radius.
         out: the HTML file; an existing one is replaced.
         baselines: whether to evaluate the oracle and the wall follower too.
+        epsilon: probability of a random action of the policies in each step; 0 is greedy.
 
     Raises:
         ValueError: a map is unusable for a robot, two runs have the same name, or the file
             cannot be written.
     """
-    content = gather_content(runs, settings, baselines=baselines)
+    content = gather_content(runs, settings, baselines=baselines, epsilon=epsilon)
     write_page(out, to_html(content, draw_pictures(content)))

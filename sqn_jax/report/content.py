@@ -17,12 +17,13 @@ from sqn_jax.evaluation.agents import (
     TrainedAgent,
     group_policies,
     with_baselines,
+    with_epsilons,
 )
 from sqn_jax.evaluation.compare import evaluate_agents, load_maps, memory_bytes, num_episodes
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.outside.messages import say
 from sqn_jax.policies.pretrained import find_policy, names_a_run
-from sqn_jax.policies.run_policies import Policy
+from sqn_jax.policies.run_policies import Policy, WhichParams
 from sqn_jax.report.episodes import WorstEpisode, worst_episodes
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.run_folder import RunFolder
@@ -57,7 +58,9 @@ class Content:
     """At most three, the worst first."""
 
 
-def read_runs(names: Sequence[str], checkpoint: int | str = "newest") -> list[Run]:
+def read_runs(
+    names: Sequence[str], checkpoint: int | str = "newest", params: WhichParams = "shipped"
+) -> list[Run]:
     """Read runs by the names that a user gives: folders, `pretrained:NAME`, or files NAME.npz.
 
     If folders in different places have the same name, the runs get the full names that were given.
@@ -65,11 +68,12 @@ def read_runs(names: Sequence[str], checkpoint: int | str = "newest") -> list[Ru
     Args:
         names: the names.
         checkpoint: of each run, see `run_policies.load_policy`.
+        params: of each run, see `run_policies.load_policy`.
 
     Raises:
         ValueError: a run is missing or damaged.
     """
-    runs = [_read_run(name, checkpoint) for name in names]
+    runs = [_read_run(name, checkpoint, params) for name in names]
     counts = Counter(run.name for run in runs)
     return [
         replace(run, name=name, policy=replace(run.policy, name=name))
@@ -79,21 +83,24 @@ def read_runs(names: Sequence[str], checkpoint: int | str = "newest") -> list[Ru
     ]
 
 
-def _read_run(name: str, checkpoint: int | str) -> Run:
-    policy = find_policy(name, checkpoint)
+def _read_run(name: str, checkpoint: int | str, params: WhichParams) -> Run:
+    policy = find_policy(name, checkpoint, params)
     if not names_a_run(name):
         return Run(name, policy, [], {})
     folder, _ = RunFolder.open(Path(name))
     return Run(policy.name, policy, folder.read_metrics(), folder.read_summary())
 
 
-def gather_content(runs: Sequence[Run], settings: Settings, *, baselines: bool) -> Content:
+def gather_content(
+    runs: Sequence[Run], settings: Settings, *, baselines: bool, epsilon: float = 0.0
+) -> Content:
     """Evaluate the runs with a progress bar.
 
     Raises:
-        ValueError: a map is unusable for a robot, or two runs have the same name.
+        ValueError: a map is unusable for a robot, two runs have the same name, or epsilon is not in
+            0..1.
     """
-    trained = group_policies([run.policy for run in runs])
+    trained = with_epsilons(group_policies([run.policy for run in runs]), [epsilon])
     for name, count in Counter(agent.name for agent in trained).items():
         if count > 1:
             raise ValueError(f"{count} runs are called {name!r}, expected different names")

@@ -91,7 +91,7 @@ def to_html(content: Content, pictures: Illustrations) -> str:
     sections = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(lead(content))}</p>',
-        f'<p class="note">{escape(_protocol(content.settings))}</p>',
+        f'<p class="note">{escape(_protocol(content.settings, content.agents[0].epsilon))}</p>',
         *_worst(content.worst, pictures.worst),
         "<h2>Success and time steps</h2>",
         success_table(content.evaluation["results"], content.settings),
@@ -152,7 +152,7 @@ def _world(entry: dict[str, Any], settings: Settings) -> str:
     return name if len(settings.tasks) == 1 else f"{name}, {entry['tasks']}"
 
 
-def _protocol(settings: Settings) -> str:
+def _protocol(settings: Settings, epsilon: float) -> str:
     seeds = f"evaluation seed {settings.seed}"
     if settings.eval_seeds > 1:
         last = settings.seed + settings.eval_seeds - 1
@@ -161,8 +161,10 @@ def _protocol(settings: Settings) -> str:
         "evaluation points": "between the evaluation points of the map",
         "random pairs": "between random pairs of spawn points",
     }
+    kind = "greedy episodes" if epsilon == 0 else "episodes"
+    actions = "" if epsilon == 0 else f", each action drawn at random with probability {epsilon:g}"
     return (
-        f"{settings.episodes:,} greedy episodes of each trained seed under {seeds}, "
+        f"{settings.episodes:,} {kind} of each trained seed under {seeds}{actions}, "
         f"{' and '.join(tasks[kind] for kind in settings.tasks)}; the goal counts as reached "
         f"within {settings.goal_radii[0]:g} m of it, and a failure counts as many time steps as "
         "an episode has."

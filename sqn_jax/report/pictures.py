@@ -11,6 +11,7 @@ import numpy as np
 from sqn_jax import figures
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.episodes import episode_keys
+from sqn_jax.evaluation.paper_results import paper_reward
 from sqn_jax.evaluation.recording import Episode, record_episodes
 from sqn_jax.evaluation.settings import task_key
 from sqn_jax.figures.animation import gif
@@ -133,7 +134,8 @@ def curves(content: Content) -> list[Illustration]:
         return []
     if len(runs) == 1:
         (run,) = runs
-        figure = figures.learning_curve(run.metrics, title=run.name)
+        reward = paper_reward(run.policy.config)
+        figure = figures.learning_curve(run.metrics, title=run.name, paper_reward=reward)
         return [_curve(figure, "Reward, success, loss and, with several skills, their weights.")]
     rows = {id(run.policy): run.metrics for run in runs}
     by_agent = {
@@ -144,8 +146,9 @@ def curves(content: Content) -> list[Illustration]:
     pictures = [
         _curve(
             figures.learning_curves(by_agent, title="All agents"),
-            "Mean reward and success under exploration noise; if an agent has several training "
-            "seeds, the line is their mean and the band its 95 % interval.",
+            "Mean reward and success, in evaluation if all runs have it, else under exploration "
+            "noise; if an agent has several training seeds, the line is their mean and the band "
+            "its 95 % interval.",
         )
     ]
     by_run = {run.name: run.metrics for run in runs if _has_skill_metrics(run)}

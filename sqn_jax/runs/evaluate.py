@@ -91,6 +91,23 @@ def evaluate_suite_session(
     """
     episodes = num_suite_episodes(agents, suite, settings)
     memory_budget.require(RECORD_BYTES * episodes, "keeping the episodes", "evaluate")
+    maps = suite_maps(agents, suite, source)
+    with episodes_bar(episodes) as bar:
+        evaluation, records = evaluate_suite(agents, suite, maps, settings, bar.update)
+    if out is not None:
+        write_json(out, evaluation)
+        write_records(out.with_suffix(".jsonl"), records)
+    return evaluation, records
+
+
+def suite_maps(
+    agents: Sequence[Agent], suite: TaskSuite, source: Path | None = None
+) -> dict[float, SuiteMaps]:
+    """What makes the maps of a suite, by the radius of a robot, m; its tasks are checked.
+
+    Raises:
+        ValueError: a map is unusable, or a task cannot be solved.
+    """
     radii = {robot_for(agent.env_config, suite).robot_radius for agent in agents}
     maps = {radius: SuiteMaps(partial(load_map, robot_radius=radius)) for radius in radii}
     for radius in radii:
@@ -100,9 +117,4 @@ def evaluate_suite_session(
         for task in suite.tasks:
             if task.shortest_path is None or any(agent.algorithm == "oracle" for agent in agents):
                 require_paths(maps[radius](task.map_file), "where a shortest path is searched")
-    with episodes_bar(episodes) as bar:
-        evaluation, records = evaluate_suite(agents, suite, maps, settings, bar.update)
-    if out is not None:
-        write_json(out, evaluation)
-        write_records(out.with_suffix(".jsonl"), records)
-    return evaluation, records
+    return maps

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import numpy as np
 
 import sqn_jax
 from sqn_jax.agent.learner import policy_params
@@ -12,6 +13,7 @@ from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.compare import evaluate_agents
+from sqn_jax.evaluation.paper_results import paper_reward
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.outside.messages import say
@@ -96,7 +98,9 @@ def draw_figures(
     name = f"{config.algo.upper()}, {occupancy_map.name}"
     if (count := len(config.maps.names)) > 1:
         name += f" (trained on {count} maps)"
-    curve = figures.learning_curve(folder.read_metrics(), title=name)
+    curve = figures.learning_curve(
+        folder.read_metrics(), title=name, paper_reward=paper_reward(config)
+    )
     figures.save(curve, folder.figures / "learning_curve.png")
     for batch in batches:
         tasks = batch.world.tasks
@@ -125,8 +129,9 @@ def conclude(
     has_figures: bool,
     config: TrainConfig,
     folder: RunFolder,
+    curve: dict[str, Any] | None = None,
 ) -> None:
-    """Write summary.json and print a summary."""
+    """Write summary.json, with the end of the learning curve if there is one, and print it."""
     summary: dict[str, Any] = {
         "episodes": config.num_rounds * config.num_envs,
         "wall_seconds": round(timing["train_seconds"], 1),
@@ -144,6 +149,9 @@ def conclude(
         }
         for entry in results
     }
+    if curve is not None:
+        curve = {**curve, "seconds": round(timing.get("curve_seconds", 0.0), 1)}
+        summary["learning_curve"] = curve
     # Before anything is printed: the reader of a pipe may have left.
     folder.write_json("summary.json", summary)
     say(
@@ -157,6 +165,13 @@ def conclude(
             f"[{low:.2f}, {high:.2f}], {entry['time_steps']['mean']:.0f} steps "
             f"({config.eval.episodes} greedy episodes"
             + (f" of each of {config.num_seeds} seeds)" if config.num_seeds > 1 else ")")
+        )
+    if curve is not None:
+        paper = curve["paper_mean_reward"]
+        say(
+            f"{'learning curve:':19} mean reward {np.mean(curve['mean_reward']):.2f} at its end"
+            + ("" if paper is None else f" (the paper's {config.algo.upper()}: {paper:.2f})")
+            + f"; evaluated {curve['points']} times, {_duration(curve['seconds'])} in all"
         )
     if has_figures:
         say(f"figures in {folder.figures}")

@@ -29,6 +29,7 @@ from sqn_jax.policies.interventions import with_motion_inputs
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation, streams
+from sqn_jax.runs.learning_curve import LearningCurve, summary_of
 from sqn_jax.runs.progress import episodes_bar, phase
 from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
@@ -93,7 +94,7 @@ def train_session(
     _warn_of_short_episodes(occupancy_map, config)
     program = make_program(env_params, config, mesh)
     # Errors up to here leave no files behind.
-    num_bytes = memory_bytes(env_params, program)
+    num_bytes = memory_bytes(program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
     final_evaluation.require_memory(program)
     if tensorboard:
@@ -105,20 +106,22 @@ def train_session(
         stack.enter_context(locked(run_dir))
         folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
         checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
-        runner = _restored(env_params, program, folder, checkpoints) if resume else None
+        runner = _restored(program, folder, checkpoints) if resume else None
         _announce(program, run_dir, num_bytes, resume_command)
         done = 0 if runner is None else rounds_done(runner) * config.num_envs
         board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        training = _Training(env_params, program, folder, checkpoints, start, resume_command)
-        runner = training.run(runner, None if board is None else board.scalars)
         first_map = _first_map(config, occupancy_map)
+        curve = LearningCurve(first_map, config)
+        training = _Training(env_params, program, folder, checkpoints, start, resume_command, curve)
+        runner = training.run(runner, None if board is None else board.scalars)
         phase(f"evaluating on {first_map.name}")
         results, batches = final_evaluation.evaluate_run(runner, first_map, config, folder)
         phase("drawing")
         has_figures = final_evaluation.draw_figures(batches, first_map, config, folder)
         if board is not None and has_figures:
             _add_figures(board, config, folder)
-    final_evaluation.conclude(results, training.timing, has_figures, config, folder)
+    last = summary_of(folder.read_metrics(), config)
+    final_evaluation.conclude(results, training.timing, has_figures, config, folder, last)
 
 
 def _warn_of_short_episodes(occupancy_map: OccupancyMap, config: TrainConfig) -> None:
@@ -182,9 +185,7 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: s
         say(f"if it is stopped, resume with {resume_command}", flush=True)
 
 
-def _restored(
-    env_params: EnvParams, program: Program, folder: RunFolder, checkpoints: Checkpoints
-) -> RunnerState | None:
+def _restored(program: Program, folder: RunFolder, checkpoints: Checkpoints) -> RunnerState | None:
     """The state to resume from; None if the run was stopped before its first checkpoint.
 
     Also writes the config to the folder and drops the metrics of chunks after the checkpoint.
@@ -193,7 +194,7 @@ def _restored(
     runner, chunks = None, 0
     folder.sweep()
     if checkpoints.chunks():
-        runner, saved = checkpoints.restore(runner_shapes(env_params, program))
+        runner, saved = checkpoints.restore(runner_shapes(program))
         chunks = rounds_done(runner) // config.rounds_per_chunk
         if chunks > config.num_chunks:
             episodes = chunks * config.rounds_per_chunk * config.num_envs
@@ -205,7 +206,7 @@ def _restored(
         _report_changes(saved, 1 if program.mesh is None else program.mesh.size)
         if config.method == "r2d2" and runner.learner.memory is None:
             say("saved without the replay: resuming with an empty one, not exactly as before")
-            memory = start_run(env_params, program).learner.memory
+            memory = start_run(program).learner.memory
             learner = dataclasses.replace(runner.learner, memory=memory)
             runner = dataclasses.replace(runner, learner=learner)
     else:
@@ -261,11 +262,12 @@ class _Training:
         checkpoints: Checkpoints,
         start: Policy | None,
         resume_command: str,
+        curve: LearningCurve,
     ) -> None:
         config, mesh = program.config, program.mesh
         self._env_params, self._program, self._config = env_params, program, config
         self._start, self._resume_command = start, resume_command
-        self._folder, self._checkpoints = folder, checkpoints
+        self._folder, self._checkpoints, self._curve = folder, checkpoints, curve
         self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
         self.timing: dict[str, float] = {
             "train_seconds": folder.train_seconds(),
@@ -288,14 +290,14 @@ class _Training:
             return runner
         compiled = self._compile()
         if runner is None:
-            runner = start_run(self._env_params, self._program)
+            runner = start_run(self._program)
             if self._start is not None:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
         message = "stopping after this chunk and saving"
         with deferred(message) as received, episodes_bar(total, done * config.num_envs) as bar:
             for runner, report in run(runner, self._env_params, self._program, compiled):  # noqa: B020
-                row = self._write_row(report)
+                row = self._write_row(report, runner)
                 if on_row is not None:
                     on_row(row)
                 bar.set_postfix_str(_postfix(row), refresh=False)
@@ -332,12 +334,14 @@ class _Training:
 
         return run_chunk
 
-    def _write_row(self, report: ChunkReport) -> dict[str, Any]:
-        """Update the timing by a chunk, and write its row of metrics."""
+    def _write_row(self, report: ChunkReport, runner: RunnerState) -> dict[str, Any]:
+        """Update the timing by a chunk, and write its row of metrics with those of evaluation."""
         self.timing["train_seconds"] += report.seconds
         self.timing["env_steps"] += self._config.rounds_per_chunk * self._steps_a_round
         self._successes.append(float(np.mean(report.metrics["success"])))
         row = _row(report, self.timing["train_seconds"], self._program)
+        row |= self._curve.point(report.chunk, runner.learner)
+        self.timing["curve_seconds"] = self._curve.seconds
         self._folder.append_metrics(row)
         return row
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -54,6 +55,17 @@ def read_rows(path: Path) -> tuple[list[Row], str | None]:
     except OSError as error:
         raise ValueError(f"{named(path)}: cannot be read ({error.strerror})") from None
     return rows, None
+
+
+def evaluated_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows of chunks after which the policies were evaluated: points of the learning curve."""
+
+    def is_known(value: Any) -> bool:
+        if isinstance(value, list):
+            return all(map(is_known, value))
+        return value is not None and math.isfinite(value)
+
+    return [row for row in rows if is_known(row.get("eval_mean_reward"))]
 
 
 def to_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -189,27 +189,27 @@ def _train_chunk_on_each(
 _jitted_train_chunk = jax.jit(train_chunk, static_argnames="program", donate_argnames="runner")
 
 
-def start_run(env_params: EnvParams, program: Program) -> RunnerState:
+def start_run(program: Program) -> RunnerState:
     """State of a new run: seed `config.seed`, or several with consecutive seeds side by side.
 
     Run i of several has the same key as a single run with seed `config.seed + i`. With a mesh, the
     arrays lie on its devices.
     """
-    return place(_start_run(env_params, program), program.mesh, runner_specs(program))
+    return place(_start_run(program), program.mesh, runner_specs(program))
 
 
 @partial(jax.jit, static_argnames="program")
-def _start_run(env_params: EnvParams, program: Program) -> RunnerState:
+def _start_run(program: Program) -> RunnerState:
     config = program.config
     if config.num_seeds == 1:
-        return init_runner(jax.random.key(config.seed), env_params, program)
+        return init_runner(jax.random.key(config.seed), program)
     keys = jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
-    return jax.vmap(lambda key: init_runner(key, env_params, program))(keys)
+    return jax.vmap(lambda key: init_runner(key, program))(keys)
 
 
-def runner_shapes(env_params: EnvParams, program: Program) -> RunnerState:
+def runner_shapes(program: Program) -> RunnerState:
     """Shapes, dtypes and places of what `start_run` makes, without computing anything."""
-    shapes = jax.eval_shape(partial(_start_run, program=program), env_params)
+    shapes = jax.eval_shape(partial(_start_run, program))
     return placed_shapes(shapes, program.mesh, runner_specs(program))
 
 
@@ -237,7 +237,7 @@ def compile_chunk(env_params: EnvParams, program: Program) -> tuple[CompiledChun
     """
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), program.mesh)
-    runner = runner_shapes(env_params, program)
+    runner = runner_shapes(program)
     compiled = _jitted_train_chunk.lower(runner, world, program).compile()
     return compiled, time.perf_counter() - started
 

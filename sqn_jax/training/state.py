@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,10 +19,9 @@ from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shards import AXIS
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
-from sqn_jax.env import NUM_ACTIONS, EnvParams, Observation
+from sqn_jax.env import NUM_ACTIONS, Observation
 from sqn_jax.training.devices import REPLICATED
 from sqn_jax.training.motion import first_observation
-from sqn_jax.training.rollout import random_draws, start_actors, unroll
 
 MAX_SKILLS = 256
 """Skills of a network: each is a module of its own in the program."""
@@ -40,13 +40,13 @@ class RunnerState:
     """Randomness still to come."""
 
 
-def init_runner(key: Array, env_params: EnvParams, program: Program) -> RunnerState:
+def init_runner(key: Array, program: Program) -> RunnerState:
     """The state of one run before its first round; the key is consumed."""
     # The second is not used: with two children, a seed would give another run than it always has.
     learner_key, _, run_key = jax.random.split(key, 3)
     memory = None
     if program.config.method == "r2d2":
-        memory = r2d2.init_memory(trajectory_shapes(env_params, program), program)
+        memory = r2d2.init_memory(trajectory_shapes(program), program)
     learner = init_learner(learner_key, example_obs(program.config), program, memory)
     return RunnerState(learner=learner, key=run_key)
 
@@ -100,24 +100,30 @@ def _require_sensible(config: TrainConfig) -> None:
         )
 
 
-def trajectory_shapes(env_params: EnvParams, program: Program) -> Trajectory:
-    """Shapes and dtypes of what `learn` is given, without computing anything."""
-    network, num_envs = program.network, program.config.num_envs
+def trajectory_shapes(program: Program) -> Trajectory:
+    """Shapes and dtypes of what `learn` is given.
 
-    def one_unroll(key: Array) -> Trajectory:
-        actors = start_actors(jax.random.split(key, num_envs), env_params, network)
-        params = network.init(key, jax.tree.map(lambda x: x[None], actors.obs), actors.carry)
-        draws = random_draws(key, program.window_length, num_envs)
-        epsilon = jnp.zeros(num_envs)
-        return unroll(draws, params, actors, epsilon, env_params, network)[1].for_learning()
+    Written down, not read off a rollout: to trace the simulator takes a second.
+    """
+    config, length = program.config, program.window_length
+    steps = (length, config.num_envs)
+    obs = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((length + 1, config.num_envs, *x.shape[2:]), x.dtype),
+        jax.eval_shape(partial(example_obs, config)),
+    )
+    return Trajectory(
+        obs=obs,
+        actions=jax.ShapeDtypeStruct(steps, jnp.int32),
+        rewards=jax.ShapeDtypeStruct(steps, jnp.float32),
+        terminated=jax.ShapeDtypeStruct(steps, jnp.bool_),
+        carry=jax.eval_shape(partial(initial_carry, config.network, config.num_envs)),
+    )
 
-    return jax.eval_shape(one_unroll, jax.random.key(0))
 
-
-def memory_bytes(env_params: EnvParams, program: Program) -> int:
+def memory_bytes(program: Program) -> int:
     """Bytes that the replay of all seeds and the episodes of a round will take, on all devices."""
     config = program.config
-    trajectory = trajectory_shapes(env_params, program)
+    trajectory = trajectory_shapes(program)
     total = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(trajectory))
     if config.method == "r2d2":
         total += replay.num_bytes(r2d2.packed_item(trajectory), config.replay.capacity)

@@ -13,11 +13,11 @@ from compiling import compiling_quickly
 from lattice_oracle import HEADINGS, oracle_steps
 
 from sqn_jax.agent import initial_carry, make_network
-from sqn_jax.baselines.bug import BugNavigator
+from sqn_jax.baselines.bug import Bug
 from sqn_jax.baselines.oracle import BeamSearch, Oracle
 from sqn_jax.baselines.shortest_paths import ShortestPaths, shortest_path_lengths
 from sqn_jax.config import EnvConfig, NetworkConfig
-from sqn_jax.env import EnvParams, make_env, reset, reset_to, step
+from sqn_jax.env import EnvParams, Observation, make_env, reset, reset_to, step
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluation import baseline_episodes
@@ -90,7 +90,10 @@ def test_starts_goals_and_noise_are_those_of_run_episodes() -> None:
     fields = ("obs", "actions", "rewards", "terminated", "poses", "goals", "info", "output")
     (metrics,), theirs = run_episodes(keys, params, world, network, fields=fields)
     (our_metrics,), ours = run_baseline(
-        keys, lambda obs, state: np.full(4, STAND), world, fields=fields
+        keys,
+        baseline_episodes.by_hand(lambda goals: lambda obs, state: np.full(4, STAND)),
+        world,
+        fields=fields,
     )
     np.testing.assert_array_equal(ours.poses[0], theirs.poses[0])
     np.testing.assert_array_equal(ours.goals, theirs.goals)
@@ -284,14 +287,14 @@ def test_oracle_refuses_another_map_and_a_robot_that_cannot_turn() -> None:
     with pytest.raises(ValueError, match="cannot move or turn"):
         Oracle(small, fixed, np.array([[5.025, 2.025]]))
     with pytest.raises(ValueError, match="cannot move or turn"):
-        BugNavigator(fixed.config, 1)
+        Bug(fixed.config)
 
 
 def bug_in(points: Any, *walls: tuple[float, float, float, float]) -> Any:
     """Eight episodes between two points of a room of 8 x 16 m; all such rooms compile once."""
     world = make_env(room(8, 16, points, *walls), spawn="evaluation")
     (metrics,), trajectory = run_baseline(
-        episode_keys(KEY, 8), baseline_episodes.bug(world, 8), world
+        episode_keys(KEY, 8), baseline_episodes.bug(world.config), world
     )
     return metrics, trajectory
 
@@ -341,10 +344,12 @@ def test_bug_reads_both_encodings_of_the_goal() -> None:
     distance, heading = rng.uniform(0.05, 0.9, 50), rng.uniform(-np.pi, np.pi, 50)
     linear = np.stack([distance, (heading + np.pi) / (2 * np.pi)], axis=-1)
     sincos = np.stack([distance, (1 + np.sin(heading)) / 2, (1 + np.cos(heading)) / 2], axis=-1)
-    chosen = [
-        BugNavigator(EnvConfig(heading_encoding=encoding), 50).choose(ranges, goal)
-        for encoding, goal in (("linear", linear), ("sincos", sincos))
-    ]
+    chosen = []
+    for encoding, goal in (("linear", linear), ("sincos", sincos)):
+        bug = Bug(EnvConfig(heading_encoding=encoding))
+        start = bug.start(1, jnp.float32(0.3))
+        seen = Observation(jnp.asarray(ranges, jnp.float32), jnp.asarray(goal, jnp.float32))
+        chosen.append(jax.jit(jax.vmap(bug.act, in_axes=(None, 0)))(start, seen)[1])
     np.testing.assert_array_equal(*chosen)
     assert len(np.unique(chosen[0])) > 2
 
@@ -352,35 +357,33 @@ def test_bug_reads_both_encodings_of_the_goal() -> None:
 def test_bug_reads_a_rational_goal_distance() -> None:
     """At d / (d + 5 m) it does what it does at d / 24 m, and knows how far off 60 m are."""
     rng = np.random.default_rng(1)
-    ranges = rng.uniform(0.1, 1.0, (50, 71))
+    ranges = jnp.asarray(rng.uniform(0.1, 1.0, (50, 71)), jnp.float32)
     distance, heading = rng.uniform(1.0, 22.0, 50), rng.uniform(0, 1, 50)
-    chosen = [
-        BugNavigator(EnvConfig(goal_distance_encoding=encoding), 50).choose(
-            ranges, np.stack([encoded, heading], axis=-1)
-        )
-        for encoding, encoded in (
-            ("clipped", distance / 24),
-            ("rational", distance / (distance + 5)),
-        )
-    ]
+    chosen = []
+    for encoding, encoded in (
+        ("clipped", distance / 24),
+        ("rational", distance / (distance + 5)),
+    ):
+        bug = Bug(EnvConfig(goal_distance_encoding=encoding))
+        start, act = bug.start(1, jnp.float32(0.3)), jax.jit(jax.vmap(bug.act, in_axes=(None, 0)))
+        goals = jnp.asarray(np.stack([encoded, heading], axis=-1), jnp.float32)
+        chosen.append(act(start, Observation(ranges, goals))[1])
     np.testing.assert_array_equal(*chosen)
-    far = BugNavigator(EnvConfig(goal_distance_encoding="rational"), 1)
-    far.choose(ranges[:1], np.array([[60 / 65, 0.5]]))
-    assert far.robots[0].goal is not None
-    assert abs(far.robots[0].goal) == pytest.approx(60.0, abs=1e-6)
+    far = Observation(ranges[:1], jnp.array([[60 / 65, 0.5]], jnp.float32))
+    assert np.hypot(*act(start, far)[0].goal[0]) == pytest.approx(60.0, abs=1e-3)
 
 
 def test_bug_leaves_no_gap_between_beams_unseen() -> None:
     config = EnvConfig()
-    bug = BugNavigator(config, 1)
-    readings = np.full((1, 71), 5.0)
+    bug = Bug(config)
+    readings = np.full(71, 5.0)
     behind = len(bug.directions) // 2
-    assert bug.clear_lengths(readings)[0, behind] == 5.0
+    assert bug.clear_lengths(readings)[behind] == 5.0
     # No beam looks straight back: the two beside it say what is there.
-    readings[0, [0, -1]] = 2.0
-    assert bug.clear_lengths(readings)[0, behind] < 2.0
+    readings[[0, -1]] = 2.0
+    assert bug.clear_lengths(readings)[behind] < 2.0
     # A wall at 1 m to the left, seen by the beams that meet it.
-    readings = np.where(bug.beams > 0.01, 1 / np.maximum(np.sin(bug.beams), 0.2), 5.0)[None]
-    clear = bug.clear_lengths(np.minimum(readings, 5.0))[0]
+    readings = np.where(bug.beams > 0.01, 1 / np.maximum(np.sin(bug.beams), 0.2), 5.0)
+    clear = bug.clear_lengths(np.minimum(readings, 5.0))
     assert clear[0] == 5.0
     assert clear[len(clear) // 4] == pytest.approx(1 - 0.16, abs=0.01)

@@ -23,6 +23,7 @@ AT_LEAST_ONE = {
     *("env.ray_iterations", "network.hidden_size", "network.num_skills"),
     *("network.dqn_width_factor", "replay.capacity", "replay.min_episodes"),
     *("learner.batch_size", "learner.n_step", "learner.num_passes", "eval.episodes"),
+    "eval.curve_episodes",
     *("num_seeds", "total_episodes", "num_envs", "updates_per_round", "rounds_per_chunk"),
 }
 POSITIVE = {
@@ -273,7 +274,7 @@ def changed_everywhere() -> TrainConfig:
             0.25,
         ),
         exploration=config_module.ExplorationConfig(0.9, 0.3, 0.5, True),
-        eval=config_module.EvalConfig(12, 34),
+        eval=config_module.EvalConfig(12, 34, 5, 6),
     )
     return config
 

@@ -71,6 +71,25 @@ def test_rectangles_lie_along_their_sector() -> None:
     assert width > 5 * height
 
 
+@pytest.mark.parametrize("per_quadrant", [1, 2, 3])
+def test_no_rectangle_takes_rays_less_far_than_the_strip_along_a_wall(per_quadrant: int) -> None:
+    blocked = open_map(14, 19)
+    blocked |= np.random.default_rng(per_quadrant).random(blocked.shape) < 0.15
+    table = free_rectangles(blocked, 4 * per_quadrant, 20)
+    # On average over three slopes, in the middle of each third of the sector.
+    thirds = (np.array([1, 3, 5]) / 6)[:, None]
+    for sector, row, column in np.argwhere(table):
+        angles = (sector + thirds) * (np.pi / 2 / per_quadrant)
+        cosines, sines = np.abs(np.cos(angles)), np.abs(np.sin(angles))
+        step_row, step_column = QUADRANTS[sector // per_quadrant]
+        wide = int(np.argmax(blocked[row, column::step_column]))
+        high = int(np.argmax(blocked[row::step_row, column]))
+        width, height = divmod(int(table[sector, row, column]), 256)[::-1]
+        sizes = np.array([[width, wide, 1], [height, 1, high]])
+        ours, *strips = np.minimum(sizes[0] / cosines, sizes[1] / sines).sum(axis=0)
+        assert ours >= max(strips) - 1e-4
+
+
 @pytest.mark.parametrize(
     ("sectors", "reach", "message"),
     [(0, 10, "sectors"), (6, 10, "sectors"), (8, 0, "reach"), (8, 251, "reach")],

@@ -50,6 +50,21 @@ def test_a_map_may_come_from_a_file_or_from_memory_and_is_the_same(tmp_path: Pat
     np.testing.assert_array_equal(from_file.spawn_positions, from_memory.spawn_positions)
 
 
+def test_the_tables_of_a_map_are_made_once_for_all_its_kinds_of_tasks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prepare._table.cache_clear()
+    made = []
+    far_sides = prepare.far_sides
+    monkeypatch.setattr(prepare, "far_sides", lambda x: made.append(x.shape) or far_sides(x))
+    turned = wrap_map(open_map(rows=60, columns=40), [(1.0, 1.0), (1.0, 2.0)], max_steps=33)
+    for occupancy_map in (small_map(), turned):
+        make_env(occupancy_map, spawn="training")
+        make_env(occupancy_map, spawn="evaluation")
+    # One for the beams and one for the body.
+    assert made == [(8, 40, 60), (8, 40, 60), (8, 60, 40), (8, 60, 40)]
+
+
 def test_a_robot_too_large_for_the_map_is_refused(tmp_path: Path) -> None:
     save_map(small_map(), tmp_path / "small.yaml")
     config = EnvConfig(robot_radius=1.5)
@@ -121,8 +136,11 @@ def test_a_robot_that_starts_on_the_border_of_a_cell_can_move() -> None:
     assert pose[0] < 0.2
 
 
-def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
+def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Before anything of that size is allocated."""
+    monkeypatch.setattr(prepare, "MAX_CELLS_TOGETHER", 17_000_000)
     occupied = np.zeros((40, 40), dtype=bool)
     points = np.array([[0.3, 0.3], [0.7, 0.7]])
     room = OccupancyMap("room", close_border(occupied), 0.05, 2 * points, 2 * points)
@@ -139,7 +157,7 @@ def test_maps_too_large_to_prepare_are_refused_by_what_is_too_large() -> None:
         (wide, r"4,000 x 4,000 m with env\.coverage_cell 0\.325 m are 151,"),
         (many, r"24000 spawn points with spawn_radius 1e\+06 m are 38,400,000 places"),
         (vast, r"4200 x 4200 cells, expected at most 16,777,216: coarser ones"),
-        (several, r"4200 x 4200 cells, expected at most 16,777,216: fewer maps"),
+        (several, r"4200 x 4200 cells, expected at most 17,000,000: fewer maps"),
     ):
         with pytest.raises(ValueError, match=fault):
             make_env(large)
@@ -155,3 +173,19 @@ def test_neighbours_are_the_nearest_points_and_of_two_as_near_the_first() -> Non
         others = [other for other in group if other != index]
         others.sort(key=lambda other: math.dist(points[other], points[index]))
         assert found[index].tolist() == others[:4]
+
+
+def test_on_fine_cells_the_far_sides_fit_their_bytes() -> None:
+    """5 m are 200 cells of 25 mm, more than a signed byte holds."""
+    occupied = open_map(290, 310)
+    fine = make_env(wrap_map(occupied, [(1.0, 1.0), (2.0, 2.0)], resolution=0.025))
+    sides = np.asarray(fine.sight.far_sides).reshape(290, 310, -1)[1:-1, 1:-1]
+    columns, rows = (sides << 8).astype(np.int16) >> 8, sides >> 8
+    # The sectors of the first quadrant look toward +x, +y, those of the third toward -x, -y.
+    quarter = sides.shape[-1] // 4
+    assert min(columns[..., :quarter].min(), rows[..., :quarter].min()) >= 1
+    assert (
+        max(columns[..., 2 * quarter : -quarter].max(), rows[..., 2 * quarter : -quarter].max())
+        <= 0
+    )
+    assert max(columns.max(), rows.max()) > 120

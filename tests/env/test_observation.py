@@ -14,7 +14,7 @@ from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, EnvState, make_env, observe, reset_to, step
-from sqn_jax.env.geometry import decode_distance, encode_distance
+from sqn_jax.env.geometry import decode_goal, encode_distance
 
 SAMPLES = 4000
 Unit = Literal["relative", "absolute"]
@@ -105,7 +105,8 @@ def test_a_rational_goal_distance_of_60_m_passes_the_replay_to_the_centimeter() 
     config = EnvConfig(goal_distance_encoding="rational")
     distances = np.linspace(0.0, 60.0, 5000)
     stored = np.round(distances / (distances + 5) * 65535).astype(np.uint16)
-    found = decode_distance(stored.astype(np.float32) / np.float32(65535), config)
+    shown = stored.astype(np.float32) / np.float32(65535)
+    found, _ = decode_goal(np.stack([shown, shown], axis=-1), config)
     assert np.abs(found - distances).max() < 0.0065
 
 

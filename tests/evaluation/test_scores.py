@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -15,14 +16,24 @@ from sqn_jax.evaluation.scores import (
     markdown_table,
     records,
     results_table,
+    table_note,
 )
 from sqn_jax.training.rollout import EpisodeMetrics
 
 RADIUS = 0.3
+POINTS = np.array([[0.0, 0.0], [1.0, 1.0], [9.0, 0.0]])
+WORLD: Any = SimpleNamespace(
+    tasks="evaluation points",
+    occupancy_map=SimpleNamespace(evaluation_points=POINTS, spawn_points=POINTS[:2]),
+)
 
 
 def batch(
-    training_seed: int | None, eval_seed: int, success: list[bool], **changes: Any
+    training_seed: int | None,
+    eval_seed: int,
+    success: list[bool],
+    starts: Any = None,
+    **changes: Any,
 ) -> EpisodeBatch:
     count = len(success)
     reached = np.array(success)
@@ -37,11 +48,11 @@ def batch(
     }
     return EpisodeBatch(
         agent=cast(Any, None),
-        world=cast(Any, None),
+        world=WORLD,
         training_seed=training_seed,
         eval_seed=eval_seed,
         metrics={RADIUS: EpisodeMetrics(**fields)},
-        starts=np.zeros((count, 3)),
+        starts=np.zeros((count, 3)) if starts is None else starts,
         goals=np.ones((count, 2)),
         shortest_paths=np.full(count, 6.0),
     )
@@ -106,6 +117,38 @@ def test_training_seeds_are_summed_up_by_their_interquartile_mean() -> None:
     assert metrics["success"]["iqm"] == pytest.approx((0.5 + 1.0) / 2)
     low, high = metrics["success"]["iqm_ci95"]
     assert 0 <= low < 0.75 < high <= 1
+
+
+def test_episodes_of_one_training_are_no_independent_evidence() -> None:
+    """One training always arrives, the other never: anything from 0 to 1 may come of a third."""
+    metrics = describe([batch(0, 1000, [True] * 50), batch(1, 1000, [False] * 50)], RADIUS)
+    assert metrics["success"]["mean"] == 0.5
+    assert metrics["success"]["ci95"] == [0.0, 1.0]
+    assert metrics["ci95_over"] == "training seeds and tasks"
+
+
+def test_episodes_between_the_same_points_are_no_independent_evidence() -> None:
+    """From one point a robot always arrives, from the other never."""
+    starts = np.zeros((50, 3))
+    starts[25:, 0] = 8.6
+    success = [True] * 25 + [False] * 25
+    one = batch(0, 1000, success, starts)
+    np.testing.assert_array_equal(one.routes, [1] * 25 + [7] * 25)  # Points 0 to 1, and 2 to 1.
+    metrics = describe([one, batch(0, 1001, success, starts)], RADIUS)
+    assert metrics["success"]["ci95"] == [0.0, 1.0]
+    assert metrics["ci95_over"] == "tasks"
+    pairs = dataclasses.replace(one, world=SimpleNamespace(**vars(WORLD) | {"tasks": "pairs"}))
+    assert pairs.routes.max() == 3, "by the two points that training starts from"
+    # On a single route tasks are drawn alone: near the normal approximation.
+    (low, high) = describe([batch(0, 1000, success)], RADIUS)["success"]["ci95"]
+    assert low == pytest.approx(0.5 - 1.96 * np.sqrt(0.25 / 50), abs=0.03)
+    assert high == pytest.approx(0.5 + 1.96 * np.sqrt(0.25 / 50), abs=0.03)
+
+
+def test_the_note_of_the_table_says_what_intervals_are_over() -> None:
+    one, two = {"training_seeds": [0]}, {"training_seeds": [0, 1]}
+    assert "over tasks only, one training seed" in table_note([one, one])
+    assert "over training seeds and tasks" in table_note([one, two])
 
 
 def test_no_success_and_no_shortest_way_are_said_and_not_made_up() -> None:

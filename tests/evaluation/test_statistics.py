@@ -60,6 +60,20 @@ def test_nothing_has_no_interval() -> None:
         wilson_interval(0, 0)
 
 
+@pytest.mark.parametrize(("successes", "trials"), [(0, 1), (1, 1), (0, 7), (3, 40), (500, 500)])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.99])
+def test_the_wilson_interval_is_scipy_s(successes: int, trials: int, confidence: float) -> None:
+    theirs = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    assert wilson_interval(successes, trials, confidence) == pytest.approx(tuple(theirs), abs=1e-12)
+
+
+def test_the_interquartile_mean_is_scipy_s_trimmed_mean() -> None:
+    rng = np.random.default_rng(3)
+    for count in (1, 3, 4, 5, 6, 7, 101):
+        scores = rng.random((count, 2))
+        assert interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores.ravel(), 0.25))
+
+
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
     assert interquartile_mean([100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, -90.0]) == pytest.approx(3.5)
     # Five values: one and a quarter rounds down to one at each end.
@@ -135,6 +149,20 @@ def test_the_worst_tenth_is_the_mean_of_the_lowest_scores() -> None:
     assert statistics.worst_mean([0.5, 0.25, 1.0], 0.1) == 0.25  # One at least.
 
 
+def test_bad_luck_is_among_the_worst_unless_other_tries_judge() -> None:
+    """Two maps with success 0.5: the mean over all that one try, or two, can come to."""
+    one_try = list(itertools.product((0, 1), repeat=2))
+    assert np.mean([statistics.worst_mean(tries, 0.5) for tries in one_try]) == 0.25
+    assert np.mean(
+        [
+            statistics.split_worst_mean(first, second, 0.5)
+            for first, second in itertools.product(one_try, repeat=2)
+        ]
+    ) == pytest.approx(0.5)
+    # Ranked by the first half it is the second map, by the other the third.
+    assert statistics.split_worst_mean([0.9, 0.1, 0.5], [0.8, 0.6, 0.2], 0.1) == (0.6 + 0.5) / 2
+
+
 def test_an_interval_over_tasks_is_that_of_their_mean() -> None:
     rng = np.random.default_rng(0)
     scores = rng.normal(size=(1, 400))
@@ -157,6 +185,39 @@ def test_an_interval_covers_the_spread_of_tasks_and_of_training_seeds() -> None:
     )
     low, high = statistics.clustered_interval(scores.mean(axis=0, keepdims=True))
     assert high - low < 0.4 * (expected[1] - expected[0])  # Without the seeds' own spread.
+
+
+def test_clusters_are_drawn_as_a_whole_and_tasks_within_them() -> None:
+    """By a plain loop: seeds, then clusters, then as many tasks of each as it has."""
+    rng = np.random.default_rng(4)
+    clusters = np.array([7, 7, 7, 7, 2, 2, 9, 9, 9, 2, 5, 5])
+    scores = rng.normal(size=12)[None] + 2.0 * (clusters == 9) + rng.normal(size=(3, 1))
+    scores[1, 4] = scores[2, 9] = np.nan
+    means = []
+    for _ in range(6000):
+        drawn = rng.choice(np.unique(clusters), 4)
+        tasks = np.concatenate(
+            [rng.choice(np.flatnonzero(clusters == one), (clusters == one).sum()) for one in drawn]
+        )
+        means.append(np.nanmean(scores[rng.integers(3, size=3)][:, tasks]))
+    expected = np.quantile(means, [0.025, 0.975])
+    found = statistics.clustered_interval(scores, resamples=6000, clusters=clusters)
+    assert found == pytest.approx(expected, abs=0.08)
+    together = np.ptp(statistics.clustered_interval(scores[:1], clusters=clusters))
+    assert np.ptp(statistics.clustered_interval(scores[:1])) < 0.8 * together
+
+
+def test_many_tasks_are_drawn_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = np.random.default_rng(5).normal(size=(1, 50))
+    half = 1.96 * scores.std() / np.sqrt(50)
+    for block in (60, 50 * 700):
+        monkeypatch.setattr("sqn_jax.evaluation.statistics._DRAWS_AT_ONCE", block)
+        statistics._draws_of_tasks.cache_clear()
+        found = statistics.clustered_interval(scores, resamples=2000)
+        assert found == pytest.approx((scores.mean() - half, scores.mean() + half), abs=0.04)
+    assert np.isnan(statistics.clustered_interval([[1.0, np.nan, 3.0]])).sum() == 0
+    with pytest.raises(ValueError, match="at least one score"):
+        statistics.clustered_interval([[np.nan]])
 
 
 def test_an_interval_of_nothing_but_successes_is_wilson_s_over_tasks() -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
-from sqn_jax.evaluation import episodes, suite_scores, suites
+from sqn_jax.evaluation import episodes, suite_recording, suite_scores, suites
 from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
 from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
@@ -230,6 +231,26 @@ def evaluated() -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return suites.evaluate_suite(agents, SUITE, maps, SETTINGS)
 
 
+def test_the_table_of_a_suite_says_what_its_interval_and_its_worst_tenth_are(
+    evaluated: Any,
+) -> None:
+    interval, worst = suite_scores.table_notes(evaluated[0])
+    assert interval == "95 % interval: over tasks only, one training seed"
+    assert "every other try, judged by the rest" in worst
+    once = evaluated[0] | {
+        "results": [entry | {"worst_tenth_split": None} for entry in evaluated[0]["results"]]
+    }
+    assert "reads too low" in list(suite_scores.table_notes(once))[1]
+    entry = {"worst_tenth": 0.25, "worst_tenth_split": 0.5}
+    assert suite_scores.worst_tenth(entry) == 0.5
+    assert suite_scores.worst_tenth(entry | {"worst_tenth_split": None}) == 0.25
+    # Two maps of two tasks, four tries. Even tries: 0.25, 0.75; odd ones: 1 and 0.5.
+    success = np.array([[[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 1, 0], [1, 1, 0, 1]]], float)
+    of_maps = [np.array([True, True, False, False]), np.array([False, False, True, True])]
+    assert suite_scores._split_worst(success, of_maps) == (1.0 + 0.75) / 2
+    assert suite_scores._split_worst(success[..., :1], of_maps) is None
+
+
 def test_the_oracle_arrives_on_every_map(evaluated: Any) -> None:
     of_agents = {entry["agent"]: entry for entry in evaluated[0]["results"]}
     assert of_agents["oracle"]["success"]["mean"] == 1.0
@@ -274,6 +295,37 @@ def test_failures_take_the_limit_of_their_task(evaluated: Any) -> None:
         assert record["time_steps"] <= TASKS[record["task"]].max_steps
         if not record["success"]:
             assert record["time_steps"] == TASKS[record["task"]].max_steps
+
+
+def test_a_recorded_task_is_the_first_try_of_the_evaluation_to_its_own_limit(
+    evaluated: Any,
+) -> None:
+    """Whatever the order asked for, and without the others of their maps."""
+    load = ROOMS.__getitem__
+    settings = suite_recording.first_try(SETTINGS.seed)
+    numbers = [2, 0]
+    recorded = suite_recording.record_tasks(agent(), SUITE, numbers, load, settings)
+    firsts = [r for r in evaluated[1] if r["agent"] == "sqn" and r["eval_seed"] == SETTINGS.seed]
+    for number, one in zip(numbers, recorded, strict=True):
+        (record,) = (r for r in firsts if r["task"] == number and r["episode"] == 0)
+        assert one.occupancy_map is ROOMS[TASKS[number].map_file]
+        assert one.num_steps == TASKS[number].max_steps == len(one.trajectory.covered) - 1
+        assert one.success == record["success"]
+        assert one.time_steps == record["time_steps"]
+        assert one.rewards.mean() == pytest.approx(record["mean_reward"], rel=1e-5)
+        assert one.goal_radius == pytest.approx(TASKS[number].goal_radius)
+
+
+@pytest.mark.parametrize(
+    ("collisions", "collision_ends", "expected"),
+    [([3, 5], True, 4), ([3, 5], False, 10), ([12], True, 10), ([], True, 10)],
+)
+def test_a_recorded_task_ends_where_its_episode_does(
+    collisions: list[int], collision_ends: bool, expected: int
+) -> None:
+    refused = np.isin(np.arange(LENGTH), collisions)
+    one: Any = SimpleNamespace(collisions=refused)
+    assert suite_recording._length(one, TASKS[2], collision_ends) == expected
 
 
 @pytest.mark.parametrize(

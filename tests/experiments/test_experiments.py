@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -67,7 +68,7 @@ def test_both_scripts_at_a_tiny_budget(
     assert (tmp_path / "runs" / "learning_curves.png").stat().st_size > 10_000
     capsys.readouterr()
     call(robustness.main, words, monkeypatch)
-    assert capsys.readouterr().out.count("is trained") == 4
+    assert capsys.readouterr().out.count("is trained") == 2
     results = json.loads((tmp_path / "runs" / "robustness.json").read_text())
     assert len(results["results"]) == 2 * 7 * 2  # Agents, noises, radii.
     assert (tmp_path / "runs" / "robustness.png").stat().st_size > 10_000
@@ -130,6 +131,23 @@ def test_a_benchmark_is_told_in_times_of_jaxnav_at_its_best_with_as_many_robots(
     ]
     rows = bench_simulator.table(entries).splitlines()[2:]
     assert [row.split("|")[-2].strip() for row in rows] == ["6.0", "-", "0.8", "1.0"]
+
+
+def test_the_seeds_of_an_agent_are_trained_side_by_side_in_one_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = []
+    monkeypatch.setattr(common, "_train", lambda config, folder: trained.append((config, folder)))
+    for num_seeds in ("3", "1"):
+        parser = argparse.ArgumentParser()
+        common.add_options(parser)
+        words = ["--algos", "sqn", "dqn", "--num-seeds", num_seeds, "--runs", str(tmp_path)]
+        common.train_missing(parser.parse_args(words))
+    expected = [("sqn", 3), ("dqn", 3), ("sqn", 1), ("dqn", 1)]
+    assert [(config.algo, config.num_seeds) for config, _ in trained] == expected
+    names = ["sqn_seeds0to2", "dqn_seeds0to2", "sqn_seed0", "dqn_seed0"]
+    assert [folder.name for _, folder in trained] == names
+    assert {config.seed for config, _ in trained} == {0}
 
 
 def test_runs_with_other_settings_are_not_taken_for_these(

@@ -44,6 +44,25 @@ def test_a_line_is_the_mean_over_runs_and_seeds_with_a_band_around_it() -> None:
         figures.learning_curves({"SQN": [[]]}, title="nothing")
 
 
+def test_where_all_runs_were_evaluated_the_line_is_that_of_evaluation() -> None:
+    explored = rows([0.0, 0.5], [0.1, 0.2])
+    known = [r | {"eval_mean_reward": r["mean_reward"] + 1, "eval_success": 0.9} for r in explored]
+    gap = {"episodes": 50, "mean_reward": 9.0, "success": 1.0, "eval_mean_reward": None}
+    figure = figures.learning_curves(
+        {"SQN": [[gap, *known]], "DQN": [known]}, title="training", paper_rewards={"SQN": 1.35}
+    )
+    reward, success = figure.axes
+    sqn, paper, dqn = reward.lines
+    np.testing.assert_array_equal(sqn.get_xdata(), [100, 200])
+    np.testing.assert_array_equal(sqn.get_ydata(), [1.0, 1.5])
+    np.testing.assert_array_equal(dqn.get_ydata(), [1.0, 1.5])
+    np.testing.assert_allclose(paper.get_ydata(), 1.35)
+    assert "in evaluation" in success.get_title()
+    mixed = figures.learning_curves({"SQN": [known], "DQN": [explored]}, title="training")
+    np.testing.assert_array_equal(mixed.axes[0].lines[0].get_ydata(), [0.0, 0.5])
+    assert "exploring" in mixed.axes[1].get_title()
+
+
 def entry(agent: str, velocity: float, ranges: float, success: float) -> dict[str, Any]:
     summary = {"mean": success, "ci95": [success - 0.1, success + 0.05]}
     noise = {"velocity_noise": velocity, "range_noise": ranges}

@@ -155,6 +155,26 @@ def test_unusable_rows_are_refused_by_name(rows, named):
         figures.learning_curve(rows, title="a run")
 
 
+def test_points_in_evaluation_lie_over_the_training_beside_the_paper_s_reward():
+    nothing = {"eval_mean_reward": None, "eval_success": None}
+    rows = [row(1) | nothing, row(2, eval_mean_reward=1.0, eval_success=0.5), row(3) | nothing]
+    rows.append(row(4, eval_mean_reward=1.25, eval_success=0.75))
+    figure = drawn(figures.learning_curve(rows, title="a run", paper_reward=1.35))
+    reward, success = panel(figure, "reward"), panel(figure, "Success")
+    for axes, values in ((reward, [1.0, 1.25]), (success, [0.5, 0.75])):
+        np.testing.assert_array_equal(curve(axes, "evaluation").get_xdata(), [200, 400])
+        np.testing.assert_array_equal(curve(axes, "evaluation").get_ydata(), values)
+    np.testing.assert_allclose(curve(reward, "the paper's").get_ydata(), 1.35)
+    assert "evaluation" in success.get_title()
+    box, frame = success.get_legend().get_window_extent(), success.get_window_extent()
+    assert frame.x0 <= box.x0 < box.x1 <= frame.x1, "the legend is as wide as the panel at most"
+    seeds = [
+        seeds_row(1),
+        seeds_row(2) | {"eval_mean_reward": [1.0] * 3, "eval_success": [0.5] * 3},
+    ]
+    drawn(figures.learning_curve(seeds, title="the first row is of an older state"))
+
+
 @pytest.mark.usefixtures("full_pixels")
 @pytest.mark.parametrize("skills", [1, 4])
 @pytest.mark.parametrize("make", [row, seeds_row])
@@ -163,3 +183,6 @@ def test_no_text_of_a_learning_curve_overlaps_another(skills, make):
     usage = np.broadcast_to(1 / skills, (3, skills)).tolist()
     rows = [r | {"skill_usage": usage if make is seeds_row else usage[0]} for r in rows]
     check_texts(drawn(figures.learning_curve(rows, title="SQN, maze")))
+    points = {"eval_mean_reward": 1.0, "eval_success": 0.5}
+    rows = [r | points for r in rows]
+    check_texts(drawn(figures.learning_curve(rows, title="SQN, maze", paper_reward=1.35)))

@@ -14,13 +14,13 @@ from lattice_oracle import steps_between
 from map_shapes import cell_of, fill_of_hull, inner_obstacles, is_closed, standing_room
 from scipy import ndimage, spatial
 
-from sqn_jax.config.map_names import KINDS
 from sqn_jax.maps import load_map, validate
 from sqn_jax.maps.generate import generate
 from sqn_jax.maps.terrain import carve_tunnels, fill_pockets, smooth_path, spread, value_noise
 
 SCRIPT = Path(__file__).resolve().parents[2] / "experiments/draw_maps.py"
 SEEDS = {"maze": 30, "column": 30, "forest": 30, "cave": 5}
+KINDS = tuple(SEEDS)
 EACH = [(kind, seed) for kind in KINDS for seed in range(SEEDS[kind])]
 
 made = cache(generate)

@@ -19,7 +19,8 @@ from sqn_jax.maps import (
     step_warning,
     traversable,
 )
-from sqn_jax.maps.check import evaluation_distances, grid_path
+from sqn_jax.maps.check import evaluation_distances
+from sqn_jax.maps.distance import grid_path
 
 Room = Callable[..., Path]
 

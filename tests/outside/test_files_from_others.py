@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from refusals import refusal
 from rooms import small_room
 
 from sqn_jax import reset, step
@@ -28,14 +29,6 @@ from sqn_jax.storage.lock import locked
 from sqn_jax.storage.metrics import to_text
 from sqn_jax.storage.run_folder import RunFolder, require_usable
 from sqn_jax.training.state import params_shapes
-
-
-def refusal(call: Callable[[], Any]) -> str:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
-        call()
-    message = str(caught.value)
-    assert message.isprintable()
-    return message
 
 
 @pytest.mark.parametrize("name", ["a\\b", "[a]", "gs:", "a\nb", "\x1b[31m", "\u202e", "\udcff"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from sqn_jax.env import NUM_ACTIONS
 from sqn_jax.policies import pretrained
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.render import agent_names, default_folder
+from sqn_jax.report.render_suite import worst_tasks
 
 STEPS = 12
 BEAMS = 11  # Few compile sooner.
@@ -81,6 +83,64 @@ def test_one_agent_writes_below_the_current_folder(tmp_path: Path) -> None:
     assert main(["render", *words, "--episodes", "2", "--animations", "0"]) == 0
     written = sorted(path.name for path in (tmp_path / "renders" / "one_room").iterdir())
     assert written == ["sqn_timeline_1.png", "trajectories.png"]
+
+
+def test_the_worst_tasks_have_the_least_success_of_all_agents_then_the_least_spl() -> None:
+    def entry(*tasks: tuple[float, float]) -> dict[str, list[dict[str, float]]]:
+        return {"tasks": [{"success": success, "spl": spl} for success, spl in tasks]}
+
+    one, other = entry((1, 0.9), (1, 0.2), (0, 0), (1, 0.5)), entry((1, 1), (1, 1), (0, 0), (0, 0))
+    assert worst_tasks({"results": [one, other]}, 3) == [2, 3, 1]
+    assert worst_tasks({"results": [one]}, 9) == [2, 1, 3, 0]
+
+
+def test_tasks_of_a_suite_are_drawn_by_number_at_random_actions(tmp_path: Path) -> None:
+    room = write_empty_room(tmp_path)
+    places = [((0.8, 0.8), (4.2, 3.2)), ((4.2, 3.2), (0.8, 0.8)), ((0.8, 3.2), (4.2, 0.8))]
+    suite = tmp_path / "rooms.json"
+    tasks = [
+        {"map": room.name, "start": [*start, 0.0], "goal": goal, "max_steps": STEPS}
+        for start, goal in places
+    ]
+    suite.write_text(json.dumps({"schema": 1, "name": "rooms", "tasks": tasks}))
+    words = ["pretrained:one", "pretrained:two", "--tasks", str(suite), "--pick", "2", "0"]
+    assert main(["render", *words, "--animations", "0", "--epsilon", "0.5"]) == 0
+    written = sorted(path.name for path in Path("renders/one_and_1_more_rooms").iterdir())
+    assert written == [
+        "sqn_one_epsilon_0.5_timeline_2.png",
+        "sqn_two_epsilon_0.5_timeline_2.png",
+        "trajectories.png",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--pick", "1"], "--pick 1: only with --tasks FILE.json"),
+        (["--tasks", "S.json", "--map", "maze"], "--map: not with --tasks S.json"),
+        (["--tasks", "S.json", "--max-steps", "3"], "--max-steps: not with --tasks S.json"),
+        (["--tasks", "S.json", "--pick", "worst", "1"], "--pick worst 1: expected worst alone"),
+        (["--tasks", "S.json", "--pick", "-1"], "'-1', expected the number of a task or worst"),
+        (["--tasks", "S.json", "--pick", "x"], "'x', expected the number of a task or worst"),
+        (["--tasks", "S.json", "--pick", "1", "--episodes", "2"], "--episodes: not with --pick 1"),
+        (["--tasks", "S.json", "--pick", "1"], "--pick 1: expected 0 to 0"),
+        (["--tasks", "S.json", "--pick", "0", "0"], "--pick 0: comes twice"),
+        (["--tasks", "S.json", "--animations", "5"], "animations is 5, expected 0 to the 4"),
+        (["--tasks", "none.json"], "none.json: no such file"),
+        (["--epsilon", "1.5"], "epsilon is 1.5"),
+        (["--params", "target"], "has no target parameters"),
+    ],
+)
+def test_wrong_words_about_tasks_are_named_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: list[str], fault: str
+) -> None:
+    tasks = [{"map": "maze", "start": [0, 0, None], "goal": [2, 2]}]
+    (tmp_path / "S.json").write_text(json.dumps({"schema": 1, "name": "S", "tasks": tasks}))
+    assert main(["render", "pretrained:one", *words]) == 2
+    error = capsys.readouterr().err
+    assert fault in error
+    assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["S.json"]
 
 
 def test_agents_of_one_network_are_told_apart_by_their_runs() -> None:

@@ -355,7 +355,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
     folder = RunFolder.create(path, config)
     with compiling_quickly():
         world = make_env(load_map(room_file), config.env)
-        runner = start_run(world, make_program(world, config))
+        runner = start_run(make_program(world, config))
         with Checkpoints(path, Origin(config)) as checkpoints:
             checkpoints.save(1, runner)
         for chunk in (1, 2):
@@ -375,7 +375,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
 def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
     run_dir: Path, room_file: Path, tmp_path: Path
 ) -> None:
-    arguments = [str(run_dir), "--episodes", "2", "--eval-seeds", "1"]
+    arguments = [str(run_dir), "--episodes", "2", "--eval-seeds", "1", "--epsilon", "0.5"]
     for name in ("a.html", "b.html"):
         assert main(["report", *arguments, "--out", str(tmp_path / name)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "b.html"]
@@ -390,7 +390,8 @@ def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
     found = tmp_path / "found.json"
     arguments += ["--maps", str(room_file), "--goal-radius", "0.3"]
     assert main(["evaluate", *arguments, "--out", str(found)]) == 0
-    for name, row in (("sqn", "sqn"), ("oracle", "oracle (knows the map)")):
+    sqn = "sqn, epsilon 0.5"
+    for name, row in ((sqn, sqn), ("oracle", "oracle (knows the map)")):
         own = next(
             each for each in json.loads(found.read_text())["results"] if each["agent"] == name
         )
@@ -398,6 +399,8 @@ def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
         assert success.startswith(f"{own['success']['mean']:.2f} [")
         assert steps == f"{own['time_steps']['mean']:.1f}"
     assert run_dir.name in page.text
+    assert "2 episodes of each trained seed" in page.text
+    assert "each action drawn at random with probability 0.5" in page.text
 
 
 def test_one_run_has_its_curves_several_are_compared_and_one_without_metrics_has_none() -> None:
@@ -424,7 +427,7 @@ def test_one_run_has_its_curves_several_are_compared_and_one_without_metrics_has
 def test_folders_of_the_same_name_are_told_apart(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def found(word: str, _: int | str) -> Policy:
+    def found(word: str, *_: int | str) -> Policy:
         return Policy(Path(word).name, TrainConfig(), ({},))
 
     monkeypatch.setattr("sqn_jax.report.content.find_policy", found)
@@ -447,6 +450,8 @@ def test_folders_of_the_same_name_are_told_apart(
         (["RUN", "RUN"], ["the same training seed twice"]),
         (["RUN", "--episodes", "0"], ["episodes", "0", "at least 1"]),
         (["RUN", "--tasks", "all"], ["--tasks", "points", "pairs"]),
+        (["RUN", "--epsilon", "2"], ["epsilon is 2.0", "at most 1"]),
+        (["RUN", "--params", "target"], ["--params target", "has no target"]),
     ],
 )
 def test_wrong_words_of_report_are_named_in_one_line(

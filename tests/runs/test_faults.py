@@ -18,10 +18,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
+from compiling import compiling_quickly
 from tiny_runs import TinyRuns, wait_for
 
+from sqn_jax.env import make_env
+from sqn_jax.evaluation.episodes import episode_keys, run_episodes
+from sqn_jax.maps import load_map
+from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs import streams, train
+from sqn_jax.runs.learning_curve import METRICS
+from sqn_jax.storage.run_folder import RunFolder
+from sqn_jax.training.state import network_of
 
 
 @pytest.fixture(scope="module")
@@ -289,6 +299,49 @@ def test_a_damaged_newest_checkpoint_costs_a_warning_and_its_chunk(
         "going on from chunk 5\n"
     ) in err
     tiny.assert_equal("rotten", "straight")
+
+
+# The learning curve.
+
+
+def test_a_run_trains_to_the_same_bits_whether_or_not_it_is_evaluated_on_the_way(
+    tiny: TinyRuns,
+) -> None:
+    code, out, err = tiny.call("unseen", "--eval.curve-points", "0")
+    assert code == 0, err
+    assert "learning curve" not in out
+    assert tiny.digests("unseen") == tiny.digests("straight")
+    for own, other in zip(tiny.rows("unseen"), tiny.rows("straight"), strict=True):
+        assert {name for name in own if own[name] != other[name]} <= set(METRICS)
+        has_point = other["chunk"] % 2 == 0  # Five points in ten chunks.
+        assert all((other[name] is None) != has_point for name in METRICS)
+        assert all(own[name] is None for name in METRICS)
+
+
+def test_a_point_of_the_curve_is_the_greedy_policy_that_is_shipped_on_tasks_of_its_own(
+    tiny: TinyRuns,
+) -> None:
+    """The last point, by the policy read from the folder and a mean over its steps."""
+    config = RunFolder.open(tiny.folder / "straight")[1]
+    policy = load_policy(tiny.folder / "straight")
+    room = load_map(config.map, robot_radius=config.env.robot_radius)
+    world = make_env(room, config.env, spawn="evaluation")
+    keys = episode_keys(jax.random.fold_in(jax.random.key(1_000), 3), 8)
+    with compiling_quickly():
+        (metrics,), trajectory = run_episodes(
+            keys, policy.params[0], world, network_of(config), fields=("poses", "goals", "rewards")
+        )
+    last = tiny.rows("straight")[-1]
+    assert last["eval_mean_reward"] == pytest.approx(trajectory.rewards.mean(), rel=1e-5)
+    assert last["eval_success"] == metrics.success.mean()
+    assert last["eval_time_steps"] == metrics.time_steps.mean()
+    places = np.concatenate([trajectory.poses[0, :, :2], trajectory.goals])
+    distances = np.linalg.norm(places[:, None] - room.evaluation_points, axis=-1)
+    assert distances.min(axis=1).max() <= room.spawn_radius + 1e-6
+    summary = json.loads((tiny.folder / "straight" / "summary.json").read_text())
+    assert summary["learning_curve"]["points"] == 5
+    assert summary["learning_curve"]["mean_reward"] == last["eval_mean_reward"]
+    assert summary["learning_curve"]["paper_mean_reward"] is None  # Not the maze.
 
 
 # Settings.

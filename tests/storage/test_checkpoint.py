@@ -52,7 +52,7 @@ def world() -> EnvParams:
 def states(world: EnvParams) -> list[RunnerState]:
     """Three states of one run in which every number differs from one to the next."""
     with compiling_quickly():
-        start = loop.start_run(world, loop.make_program(world, config_for()))
+        start = loop.start_run(loop.make_program(world, config_for()))
 
     def moved(by: int) -> RunnerState:
         def shift(x: Any) -> Any:
@@ -67,7 +67,7 @@ def states(world: EnvParams) -> list[RunnerState]:
 
 @pytest.fixture(scope="module")
 def shapes(world: EnvParams) -> RunnerState:
-    return loop.runner_shapes(world, loop.make_program(world, config_for()))
+    return loop.runner_shapes(loop.make_program(world, config_for()))
 
 
 @pytest.fixture(scope="module")
@@ -294,7 +294,7 @@ def test_another_network_is_told_in_a_table_and_nothing_is_moved(
 ) -> None:
     wide = dataclasses.replace(config_for(), network=NetworkConfig(hidden_size=16), seed=3)
     with opened(folder, wide) as checkpoints, pytest.raises(Mismatch) as error:
-        checkpoints.restore(loop.runner_shapes(world, loop.make_program(world, wide)))
+        checkpoints.restore(loop.runner_shapes(loop.make_program(world, wide)))
     lines = [line.split() for line in error.value.table.splitlines()]
     assert ["network.hidden_size", "8", "16"] in lines
     assert ["network.layer_norm", "True", "False"] in lines
@@ -308,7 +308,7 @@ def test_another_network_is_told_in_a_table_and_nothing_is_moved(
 def test_another_form_of_the_state_is_told_array_by_array(folder: Path, world: EnvParams) -> None:
     """As when another version of the program wrote it."""
     two_seeds = dataclasses.replace(config_for(), num_seeds=2)
-    shapes = loop.runner_shapes(world, loop.make_program(world, two_seeds))
+    shapes = loop.runner_shapes(loop.make_program(world, two_seeds))
     with opened(folder) as checkpoints, pytest.raises(Mismatch) as error:
         checkpoints.restore(shapes)
     assert "rest/round" in error.value.table

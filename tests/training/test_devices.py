@@ -123,7 +123,7 @@ def test_two_devices_make_the_run_that_one_makes(
     found = []
     for chosen in (None, mesh):
         program = make_program(world, config, chosen)
-        runner = loop.start_run(world, program)
+        runner = loop.start_run(program)
         *_, (runner, last) = loop.run(runner, world, program)
         found.append((runner, last.metrics))
     (one, told_by_one), (two, told_by_two) = found
@@ -150,11 +150,11 @@ def test_a_run_saved_on_two_devices_goes_on_and_is_evaluated_on_one(
 ) -> None:
     config = config_for(method)
     one, both = (make_program(world, config, chosen) for chosen in (None, mesh))
-    runner = loop.start_run(world, both)
+    runner = loop.start_run(both)
     with Checkpoints(tmp_path, Origin(config)) as checkpoints:
         checkpoints.save(1, runner)
-        alone, _ = checkpoints.restore(loop.runner_shapes(world, one))
-        again, _ = checkpoints.restore(loop.runner_shapes(world, both))
+        alone, _ = checkpoints.restore(loop.runner_shapes(one))
+        again, _ = checkpoints.restore(loop.runner_shapes(both))
         params = checkpoints.restore_policy(params_shapes(config), averaged=config.averages_params)
     for found, where in ((alone, 1), (again, 2)):
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(runner), strict=True):

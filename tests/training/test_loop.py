@@ -131,7 +131,7 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "train_round", counted)
         compiled, _ = loop.compile_chunk(world, program)
-        runner, metrics, traces = loop.start_run(world, program), [], []
+        runner, metrics, traces = loop.start_run(program), [], []
         keys = [tuple(numbers(runner.key)[0].tolist())]
         for _ in range(config.num_chunks):
             runner, chunk = compiled(runner, world)
@@ -139,7 +139,7 @@ def trained(config: TrainConfig, world: EnvParams) -> Trained:
             traces.append(count)
             keys.append(tuple(numbers(runner.key)[0].tolist()))
         again = make_program(world, config)
-        for _ in loop.run(loop.start_run(world, again), world, again):
+        for _ in loop.run(loop.start_run(again), world, again):
             traces.append(count)
     return Trained(program, world, compiled, runner, metrics, traces, keys)
 
@@ -167,7 +167,7 @@ def other_seed(smoke: Trained) -> tuple[RunnerState, list[Any]]:
     """The smoke preset from the next seed, in the same program."""
     config = dataclasses.replace(smoke.config, seed=smoke.config.seed + 1)
     with compiling_quickly():
-        runner = loop.start_run(smoke.world, make_program(smoke.world, config))
+        runner = loop.start_run(make_program(smoke.world, config))
     return all_chunks(runner, smoke)
 
 
@@ -192,7 +192,7 @@ def test_a_state_from_a_checkpoint_gets_the_program_of_a_new_one(smoke: Trained)
 
 
 def test_the_same_seed_gives_the_same_numbers_bit_for_bit(either: Trained) -> None:
-    runner = loop.start_run(either.world, either.program)
+    runner = loop.start_run(either.program)
     final, metrics = all_chunks(runner, either)
     assert_same_bits(final, either.final)
     assert_same_bits(metrics, either.metrics)
@@ -230,10 +230,10 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
     """
     program = make_program(smoke.world, dataclasses.replace(smoke.config, num_seeds=2))
     with compiling_quickly():
-        runners = loop.start_run(smoke.world, program)
+        runners = loop.start_run(program)
     for index in range(2):
         config = dataclasses.replace(smoke.config, seed=smoke.config.seed + index)
-        alone = loop.start_run(smoke.world, make_program(smoke.world, config))
+        alone = loop.start_run(make_program(smoke.world, config))
         np.testing.assert_array_equal(numbers(runners.key)[0][index], numbers(alone.key)[0])
         for one, other in zip(
             numbers(runners.learner.params), numbers(alone.learner.params), strict=True
@@ -250,7 +250,7 @@ def test_side_by_side_each_seed_does_what_it_does_alone(
 
 
 def test_the_state_given_to_a_chunk_is_donated(either: Trained) -> None:
-    runner = loop.start_run(either.world, either.program)
+    runner = loop.start_run(either.program)
     new_runner, _ = either.compiled(runner, either.world)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(runner))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(new_runner))
@@ -259,7 +259,7 @@ def test_the_state_given_to_a_chunk_is_donated(either: Trained) -> None:
 
 def test_a_run_resumed_mid_way_ends_as_the_uninterrupted_one(either: Trained) -> None:
     config, world, program = either.config, either.world, either.program
-    start = loop.start_run(world, program)
+    start = loop.start_run(program)
     runner, report = next(loop.run(start, world, program))
     assert report.chunk == 1
     # The next chunk would take the state itself.
@@ -275,7 +275,7 @@ def test_a_run_resumed_mid_way_ends_as_the_uninterrupted_one(either: Trained) ->
 
 def test_reports_say_what_the_rounds_did(either: Trained) -> None:
     config, world, program = either.config, either.world, either.program
-    reports = [r for _, r in loop.run(loop.start_run(world, program), world, program)]
+    reports = [r for _, r in loop.run(loop.start_run(program), world, program)]
     assert [report.chunk for report in reports] == list(range(1, config.num_chunks + 1))
     for report, rounds in zip(reports, either.metrics, strict=True):
         assert set(report.metrics) == set(rounds) == METRICS
@@ -334,14 +334,14 @@ def test_memory_is_foretold_to_the_byte(paper: Trained) -> None:
     replay_bytes = sum(array.nbytes for array in jax.tree.leaves(paper.final.learner.memory))
     # A round: 25 observations of 73 floats, 24 steps of 9 bytes, 128 floats, for four robots.
     round_bytes = 4 * (25 * 73 * 4 + 24 * (4 + 4 + 1) + 128 * 4)
-    assert memory_bytes(paper.world, paper.program) == replay_bytes + round_bytes
+    assert memory_bytes(paper.program) == replay_bytes + round_bytes
     two_seeds = make_program(paper.world, dataclasses.replace(paper.config, num_seeds=2))
-    assert memory_bytes(paper.world, two_seeds) == 2 * (replay_bytes + round_bytes)
+    assert memory_bytes(two_seeds) == 2 * (replay_bytes + round_bytes)
 
 
 def test_the_replay_of_the_paper_preset_fits_in_half_a_gigabyte(maze: EnvParams) -> None:
     assert maze.max_steps == 400
-    assert memory_bytes(maze, make_program(maze, PRESETS["paper"])) < 0.5e9
+    assert memory_bytes(make_program(maze, PRESETS["paper"])) < 0.5e9
 
 
 def test_the_quick_preset_trains_for_a_chunk(maze: EnvParams) -> None:
@@ -349,7 +349,7 @@ def test_the_quick_preset_trains_for_a_chunk(maze: EnvParams) -> None:
     world = world_of(config, maze)
     program = make_program(world, config)
     with compiling_quickly():
-        _, report = next(loop.run(loop.start_run(world, program), world, program))
+        _, report = next(loop.run(loop.start_run(program), world, program))
     assert set(report.metrics) == METRICS
     assert np.isfinite(report.metrics["loss"])
     assert report.metrics["updates"] == config.rounds_per_chunk * 2

@@ -173,7 +173,7 @@ def test_training_and_evaluation_take_motion_from_end_to_end(method: str) -> Non
     )
     room = small_room(60, max_steps=60)
     program = loop.make_program(room, config)
-    runner = loop.runner_shapes(room, program)
+    runner = loop.runner_shapes(program)
     after, _ = jax.eval_shape(partial(loop.train_chunk, program=program), runner, room)
     assert jax.tree.structure(after) == jax.tree.structure(runner)
     params = params_shapes(config)

@@ -1,0 +1,1 @@
+"""A policy of sqn_jax on a robot. All but `node` knows no ROS and needs NumPy alone."""

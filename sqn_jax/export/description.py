@@ -1,0 +1,94 @@
+"""What a robot's computer must know of a policy, and which policies can be exported at all."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from sqn_jax import __version__
+from sqn_jax import config as configs
+from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.env import ACTION_NAMES
+from sqn_jax.env.geometry import beam_angles
+from sqn_jax.env.prepare import commands_of
+from sqn_jax.policies.run_policies import Policy
+
+BEAM_ORDER = "from right to left; 0 is straight ahead, positive to the left"
+
+KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
+    NetworkConfig: frozenset({"hidden_size", "num_skills", "layer_norm", "dqn_width_factor"}),
+    EnvConfig: frozenset(
+        {
+            # What the graph and `sqn_policy.py` act on.
+            *("num_beams", "field_of_view_deg", "max_range", "max_goal_distance"),
+            *("heading_encoding", "forward_speed", "backward_speed", "turn_rate", "time_step"),
+            # What a policy in use has nothing to do with, or is only described.
+            *("robot_radius", "goal_radius", "max_steps", "coverage_cell", "ray_sectors"),
+            *("ray_iterations", "velocity_noise", "velocity_noise_unit", "range_noise"),
+            *("range_noise_unit", "near_goal_fraction", "reward_navigation"),
+            *("reward_exploration", "reward_time"),
+        }
+    ),
+}
+"""The settings of which an export knows what they mean; others may only have their default."""
+
+KNOWN_CHOICES = {"algo": ("sqn", "r2d2", "dqn"), "env.heading_encoding": ("linear", "sincos")}
+
+
+def require_exportable(config: TrainConfig) -> None:
+    """Refuse by name what the exported files do not compute.
+
+    Raises:
+        ValueError: a setting of the network or of what it sees is unknown here.
+    """
+    for prefix, group in (("network", config.network), ("env", config.env)):
+        known = KNOWN_SETTINGS[type(group)]
+        for field in dataclasses.fields(group):
+            value = getattr(group, field.name)
+            default = getattr(type(group)(), field.name)
+            if field.name not in known and value != default:
+                raise ValueError(
+                    f"{prefix}.{field.name} is {value!r}, which cannot be exported, expected "
+                    f"{default!r}"
+                )
+    values = configs.flat(configs.to_dict(config))
+    for name, choices in KNOWN_CHOICES.items():
+        if values[name] not in choices:
+            raise ValueError(
+                f"{name} is {values[name]!r}, which cannot be exported, expected one of "
+                f"{', '.join(choices)}"
+            )
+
+
+def describe_robot(config: TrainConfig) -> dict[str, Any]:
+    """The robot that a policy is for: what stands in `config.json` and in the ONNX file.
+
+    Returns:
+        Numbers, texts and lists of them; each name ends in its unit, where it has one.
+    """
+    env = config.env
+    return {
+        "agent": config.algo,
+        "beam_angles_rad": beam_angles(env).tolist(),
+        "beam_order": BEAM_ORDER,
+        "max_range_m": env.max_range,
+        "actions": list(ACTION_NAMES),
+        "commands_m_s_rad_s": [
+            [float(number) for number in command] for command in commands_of(env).tolist()
+        ],
+        "time_step_s": env.time_step,
+        "robot_radius_m": env.robot_radius,
+        "goal_radius_m": env.goal_radius,
+        "max_goal_distance_m": env.max_goal_distance,
+        "heading_encoding": env.heading_encoding,
+    }
+
+
+def describe_policy(policy: Policy) -> dict[str, Any]:
+    """The contents of `config.json` but for the digest: name, versions, robot, all settings."""
+    return {
+        "name": policy.name,
+        "versions": {"sqn_jax": __version__},
+        "robot": describe_robot(policy.config),
+        "config": configs.to_public_dict(policy.config),
+    }

@@ -1,0 +1,1 @@
+"""The kinds of procedural maps, a module each, and what several of them share."""

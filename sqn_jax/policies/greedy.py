@@ -1,0 +1,92 @@
+"""A trained policy that acts: one step of one robot at a time, greedily."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from sqn_jax.agent.networks import HasObservation, Params, QNetwork, QOutput, initial_carry
+from sqn_jax.config import TrainConfig
+from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.policies.run_policies import of_seed
+from sqn_jax.training.state import network_of
+
+
+@dataclass(frozen=True, eq=False)
+class GreedyPolicy:
+    """One trained network; it takes the action of the largest value.
+
+    Example:
+        >>> policy = load_policy("pretrained:sqn")
+        >>> carry = policy.start()
+        >>> action, carry = policy.act(obs, carry)
+    """
+
+    name: str
+    config: TrainConfig
+    """How it was trained: network, robot, sensors."""
+    params: Params
+
+    def start(self) -> Array:
+        """The recurrent state [H] at the start of an episode."""
+        return initial_carry(self.config.network, 1)[0]
+
+    def act(self, obs: HasObservation, carry: Array) -> tuple[Array, Array]:
+        """Choose an action.
+
+        Args:
+            obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot; for a policy with
+                `network.motion_inputs` what `training.motion` makes of it.
+            carry: [H] from `start` or the step before.
+
+        Returns:
+            The action, 0 to 4, and the next carry.
+        """
+        carry, output = self.step(obs, carry)
+        return output.q_values.argmax(), carry
+
+    def step(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
+        """The next carry [H] and all that the network says of an observation, without batch axes.
+
+        See `act`.
+
+        Raises:
+            ValueError: the policy looks at its last action, and `obs` does not tell it.
+        """
+        if self.config.network.motion_inputs and not hasattr(obs, "motion"):
+            raise ValueError(
+                f"policy {self.name} has network.motion_inputs, expected a MotionObservation: "
+                "see sqn_jax.training.motion"
+            )
+        return cast(
+            tuple[Array, QOutput], step_network(self.params, obs, carry, network_of(self.config))
+        )
+
+
+@partial(jax.jit, static_argnames="network")
+def step_network(
+    params: Params, obs: HasObservation, carry: Array, network: QNetwork
+) -> tuple[Array, QOutput]:
+    """One step of a network for one robot, without axes of time and batch."""
+    sequence = jax.tree.map(lambda x: jnp.asarray(x)[None, None], obs)
+    carry, output = network.apply(params, sequence, carry[None])
+    return carry[0], jax.tree.map(lambda x: x[0, 0], output)
+
+
+def load_policy(name: str, *, seed: int | None = None) -> GreedyPolicy:
+    """A trained policy by the name a user gives, ready to act.
+
+    Args:
+        name: a run folder, `pretrained:NAME`, or a file NAME.npz.
+        seed: the training seed, of a run with several.
+
+    Raises:
+        ValueError: there is none, it is damaged, or it has several seeds and none is named.
+    """
+    policy = of_seed(find_policy(name), seed)
+    return GreedyPolicy(policy.name, policy.config, policy.params[0])

@@ -1,0 +1,47 @@
+"""Sensors between a policy and the simulator, beside arithmetic by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.deployment import SENSORS, Sensor, SensorNetwork, sensor_arrays
+from sqn_jax.config import EnvConfig
+from sqn_jax.env import Observation
+
+BEAMS = EnvConfig(num_beams=5, field_of_view_deg=320, max_range=5)  # -160, -80, 0, 80, 160 degrees.
+RANGES = (0.2, 1.0, 0.6, 0.61, 0.9)
+
+
+def seen(sensor: Sensor) -> list[float]:
+    """What the network gets of RANGES."""
+    echo = SimpleNamespace(config=None, apply=lambda params, obs, carry: (carry, obs.ranges))
+    network: Any = SensorNetwork(echo)  # type: ignore[arg-type]
+    params = {"network": None, "sensor": sensor_arrays(sensor, BEAMS)}
+    obs = Observation(ranges=jnp.float32(RANGES)[None, None], goal=jnp.zeros((1, 1, 2)))
+    _, ranges = network.apply(params, obs, None)
+    return np.asarray(ranges)[0, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "expected"),
+    [
+        (Sensor(), RANGES),
+        (Sensor(270), (1.0, 1.0, 0.6, 0.61, 1.0)),
+        (Sensor(270, unseen=0.0), (0.0, 1.0, 0.6, 0.61, 0.0)),
+        (Sensor(160), (1.0, 1.0, 0.6, 0.61, 1.0)),
+        (Sensor(max_range=3.0), (0.2, 1.0, 0.6, 1.0, 1.0)),
+        (Sensor(max_range=3.0, beyond=0.6), (0.2, 0.6, 0.6, 0.6, 0.6)),
+        (Sensor(159, max_range=3.0), (1.0, 1.0, 0.6, 1.0, 1.0)),
+    ],
+)
+def test_a_sensor_changes_what_it_does_not_see(sensor: Sensor, expected: tuple[float]) -> None:
+    assert seen(sensor) == pytest.approx(expected)
+
+
+def test_one_of_the_sensors_is_that_of_the_training() -> None:
+    assert seen(SENSORS["as trained"]) == pytest.approx(RANGES)
