@@ -42,6 +42,9 @@ class TrainConfig:
     """A map of the project by name, the path of a ROS map_server YAML file, a procedural map
     ("maze:7"), or several side by side, "maze*8,maze:0-14", here with eight times as many tasks on
     the first; evaluated is the first."""
+    task_sampling: Literal["uniform", "learnability"] = "uniform"
+    """Of several maps: tasks from all alike, or most from those on which about every other goal is
+    reached."""
     start_from: str = ""
     """A trained policy to start from in place of random parameters: a run folder,
     "pretrained:sqn" or a file NAME.npz. Its network and sensors must be those of this run."""

@@ -51,8 +51,7 @@ def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     """
     keys = jax.random.split(key, 7)
     start_key, goal_key, start_place_key, goal_place_key, heading_key, near_key, which_key = keys
-    draw = jax.random.randint(start_key, (), 0, params.start_points.shape[0])
-    start_point = params.start_points[draw]
+    start_point = _draw_start_point(start_key, params)
     first, group_size = params.spawn_groups[start_point]
     other = jax.random.randint(goal_key, (), 1, group_size)
     neighbors = params.spawn_neighbors[start_point]
@@ -63,6 +62,16 @@ def sample_task(key: Array, params: EnvParams) -> tuple[Array, Array]:
     start = _place_near(start_place_key, start_point, params)
     heading = jax.random.uniform(heading_key, (), minval=-jnp.pi, maxval=jnp.pi)
     return jnp.append(start, heading), _place_near(goal_place_key, goal_point, params)
+
+
+def start_point_of(key: Array, params: EnvParams) -> Array:
+    """The number of the spawn point near which `reset` of this key starts."""
+    task_key, _ = jax.random.split(key)
+    return _draw_start_point(jax.random.split(task_key, 7)[0], params)
+
+
+def _draw_start_point(key: Array, params: EnvParams) -> Array:
+    return params.start_points[jax.random.randint(key, (), 0, params.start_points.shape[0])]
 
 
 def _place_near(key: Array, point: Array, params: EnvParams) -> Array:

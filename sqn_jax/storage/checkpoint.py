@@ -280,6 +280,7 @@ def _reason(error: Exception) -> str:
 def _split(runner: RunnerState) -> dict[str, Any]:
     """Parameters, their slow copy, replay, and all else as plain trees; keys as raw numbers."""
     learner = runner.learner
+    map_success = {} if runner.map_success is None else {"map_success": runner.map_success}
     items = {
         "params": learner.params,
         "target_params": learner.target_params,
@@ -290,6 +291,7 @@ def _split(runner: RunnerState) -> dict[str, Any]:
             "num_skipped": learner.num_skipped,
             "key": _key_data(runner.key),
             "round": learner.round,
+            **map_success,
         },
     }
     return {name: item for name, item in items.items() if item is not None}
@@ -322,4 +324,5 @@ def _join(items: Any) -> RunnerState:
         num_updates=rest["num_updates"],
         num_skipped=rest["num_skipped"],
     )
-    return RunnerState(learner=learner, key=jax.random.wrap_key_data(rest["key"]))
+    key = jax.random.wrap_key_data(rest["key"])
+    return RunnerState(learner, key, rest.get("map_success"))

@@ -31,9 +31,11 @@ from sqn_jax.agent.shards import mean, own_shard
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
+from sqn_jax.training.curriculum import by_learnability, with_outcomes
 from sqn_jax.training.devices import place, placed_shapes
 from sqn_jax.training.rollout import (
     ActorState,
+    EpisodeMetrics,
     episode_metrics,
     join_windows,
     own_worlds,
@@ -75,6 +77,7 @@ def train_round(
     done = progress(runner.learner, program)
     epsilon = epsilon_per_robot(done, config.num_envs, config.exploration)
     epsilon = own_shard(epsilon, axis_name)
+    env_params = by_learnability(env_params, runner.map_success)
     env_params = own_worlds(env_params, config.randomization, config.num_envs, axis_name)
     start_keys = own_shard(jax.random.split(start_key, config.num_envs), axis_name)
     actors = start_actors(start_keys, env_params, program.network)
@@ -87,7 +90,9 @@ def train_round(
     (learner, *_), (windows, learning) = jax.lax.scan(
         one_window, (runner.learner, actors, has_restarted), window_keys
     )
-    metrics = mean(_rollout_metrics(join_windows(windows), env_params), axis_name) | {
+    trajectory = join_windows(windows)
+    episodes = episode_metrics(trajectory, env_params.goal_radius)
+    metrics = mean(_rollout_metrics(episodes, trajectory), axis_name) | {
         "updates": learner.num_updates,
         "skipped_updates": learner.num_skipped,
         "finite": _is_finite(learner),
@@ -96,7 +101,10 @@ def train_round(
         **jax.tree.map(jnp.mean, learning),
     }
     learner = dataclasses.replace(learner, round=learner.round + 1)
-    return RunnerState(learner=learner, key=key), metrics
+    map_success = with_outcomes(
+        runner.map_success, start_keys, episodes.success, env_params, axis_name
+    )
+    return RunnerState(learner, key, map_success), metrics
 
 
 def rollout_and_learn(
@@ -126,9 +134,8 @@ def rollout_and_learn(
     return (learner, actors, has_restarted), (trajectory, metrics)
 
 
-def _rollout_metrics(trajectory: Trajectory, env_params: EnvParams) -> Metrics:
+def _rollout_metrics(episodes: EpisodeMetrics, trajectory: Trajectory) -> Metrics:
     """Means over the robots of an episode."""
-    episodes = episode_metrics(trajectory, env_params.goal_radius)
     return {
         "mean_reward": episodes.mean_reward.mean(),
         "success": episodes.success.mean(),

@@ -20,6 +20,7 @@ from sqn_jax.agent.shards import AXIS
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
+from sqn_jax.training.curriculum import initial_success
 from sqn_jax.training.devices import REPLICATED
 from sqn_jax.training.motion import first_observation
 
@@ -38,6 +39,8 @@ class RunnerState:
     """Parameters, optimizer, replay and counters."""
     key: Array
     """Randomness still to come."""
+    map_success: Array | None = None
+    """[MAX_MAPS] recent success on each map; None with `task_sampling` uniform."""
 
 
 def init_runner(key: Array, program: Program) -> RunnerState:
@@ -48,7 +51,7 @@ def init_runner(key: Array, program: Program) -> RunnerState:
     if program.config.method == "r2d2":
         memory = r2d2.init_memory(trajectory_shapes(program), program)
     learner = init_learner(learner_key, example_obs(program.config), program, memory)
-    return RunnerState(learner=learner, key=run_key)
+    return RunnerState(learner, run_key, initial_success(program.config))
 
 
 def example_obs(config: TrainConfig) -> Observation:
@@ -147,4 +150,5 @@ def runner_specs(program: Program) -> RunnerState:
         num_updates=each,
         num_skipped=each,
     )
-    return RunnerState(learner=learner, key=each)
+    samples_tasks = program.config.task_sampling == "learnability"
+    return RunnerState(learner, key=each, map_success=each if samples_tasks else None)

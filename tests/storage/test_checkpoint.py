@@ -34,6 +34,7 @@ def config_for(method: Any = "r2d2", **changes: Any) -> TrainConfig:
     return dataclasses.replace(
         PRESETS["smoke"],
         method=method,
+        task_sampling="learnability",
         num_envs=4,
         total_episodes=16,
         network=NetworkConfig(hidden_size=8, layer_norm=True),
