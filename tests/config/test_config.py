@@ -224,7 +224,7 @@ def changed_everywhere() -> TrainConfig:
         algo="dqn",
         method="pqn",
         map="somewhere/else.yaml",
-        start_from="pretrained:sqn",
+        map="somewhere/else.yaml",
         seed=7,
         num_seeds=2,
         total_episodes=90,
