@@ -52,10 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run() -> NoReturn:
-    """Run `main` and end the process with its exit code.
+    """Run `main` and end the process with its exit code, at once: all files are written.
 
-    After a signal or a failure the process ends at once: threads of XLA or Orbax may still be
-    running, and would crash or print errors while Python shuts down.
+    To take down what JAX has traced takes Python a second, and after a signal or a failure threads
+    of XLA or Orbax may still be running, which would crash or print errors meanwhile.
     """
     end_at_once()
     streams.install()
@@ -66,9 +66,7 @@ def run() -> NoReturn:
     failure = streams.failure()
     if failure is not None and code == 0:
         code = _fail(failure) if failure else 1
-    if code == 1 or code > 128:
-        os._exit(code)
-    sys.exit(code)
+    os._exit(code)
 
 
 def _dispatch(arguments: list[str]) -> int:

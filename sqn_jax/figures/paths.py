@@ -36,6 +36,13 @@ MAX_PATHS = 8  # in a panel; more would hide each other
 _WEIGHT_MAP = ListedColormap(colormaps["plasma"](np.linspace(0.8, 0.0, 256)))
 
 
+_LEFT_IN, _BELOW_IN, _HEAD_IN = 0.6, 0.95, 0.55
+"""Room for the labels at the left, for those and the legend below, and for the head, inches."""
+_TITLE_IN, _GAP_IN, _BAR_IN, _TALLEST_IN = 0.32, 0.18, 0.8, 9.0
+"""Height of a panel's title, gap beside a panel, width of a color bar with its labels, and height
+of the tallest panel, inches."""
+
+
 class _Panel(NamedTuple):
     """A goal (x, y) m and the indices of its episodes; `reached` begins with the fastest."""
 
@@ -95,7 +102,7 @@ def trajectories(
     panels = _chosen_panels(all_panels, max_panels)
     free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot_radius)
     fields = goal_distance(free, occupancy_map.resolution, [panel.goal for panel in panels])
-    figure, grid = _panel_grid(occupancy_map, len(panels))
+    figure, grid, bars = _panel_grid(occupancy_map, len(panels), num_bars=2 if skills > 1 else 1)
     norm = Normalize(0.0, float(fields[np.isfinite(fields)].max()))
     for axes, panel, field in zip(grid, panels, fields, strict=True):
         image = draw_field(axes, occupancy_map, field, norm)
@@ -104,19 +111,18 @@ def trajectories(
             colors = weights[:end, episode, 0] if skills > 1 else None
             _draw_path(axes, poses[: end + 1, episode], colors, reached=bool(success[episode]))
         _draw_goal(axes, panel, steps, goal_radius)
-    figure.colorbar(image, ax=grid, label="path to the goal, m", aspect=35, pad=0.02)
+    figure.colorbar(image, cax=bars[0], label="path to the goal, m")
     if skills > 1:
         lines = next(child for child in grid[0].collections if isinstance(child, LineCollection))
-        figure.colorbar(lines, ax=grid, label=SKILL_LABEL, aspect=35, pad=0.02)
+        figure.colorbar(lines, cax=bars[1], label=SKILL_LABEL)
     _add_legend(figure, goal_radius, any_failure=any(panel.failed.size for panel in panels))
     shown = f"{success.sum()} of {count} reached"
     if len(panels) < len(all_panels):
         shown += f", {len(panels)} of {len(all_panels)} goals shown"
     if max(panel.total for panel in panels) > MAX_PATHS:
         shown += f", at most {MAX_PATHS} paths a goal drawn"
-    figure.suptitle(plain(f"{title}\n{shown}"), fontsize=12)
-    # With a fixed aspect the layout needs two passes; drawing makes the first.
-    figure.draw_without_rendering()
+    height_in = figure.get_figheight()
+    figure.suptitle(plain(f"{title}\n{shown}"), y=1 - 0.08 / height_in, va="top", fontsize=12)
     return figure
 
 
@@ -174,24 +180,51 @@ def _evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     return items[np.linspace(0, items.size - 1, min(count, items.size)).round().astype(int)]
 
 
-def _panel_grid(occupancy_map: OccupancyMap, count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with one panel per goal; its height fits the shape of the map."""
+def _panel_grid(
+    occupancy_map: OccupancyMap, count: int, *, num_bars: int
+) -> tuple[Figure, list[Axes], list[Axes]]:
+    """A figure with a panel for each goal, and places for color bars at the right.
+
+    All places are computed here: what Matplotlib lays out by itself takes a second, since panels of
+    a fixed aspect need two passes.
+    """
     columns = min(count, 2)  # with three the titles would overlap
     rows = math.ceil(count / columns)
-    width, height = occupancy_map.size_m
-    panel_width = (WIDTH_IN - 2.2) / columns
-    height_in = rows * (panel_width * height / width + 0.35) + 1.2
-    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="compressed")
-    grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for axes in grid[count:]:
-        axes.remove()
-    for number, axes in enumerate(grid[:count]):
-        is_lowest, is_leftmost = number + columns >= count, number % columns == 0
-        axes.set(aspect="equal", xlim=(0, width), ylim=(0, height))
+    map_width, map_height = occupancy_map.size_m
+    bars_left = WIDTH_IN - _BAR_IN * num_bars
+    width = (bars_left - _LEFT_IN - _GAP_IN * columns) / columns
+    height = width * map_height / map_width
+    if height > _TALLEST_IN:
+        width, height = _TALLEST_IN * map_width / map_height, _TALLEST_IN
+    rows_in = rows * height + (rows - 1) * _TITLE_IN
+    height_in = _BELOW_IN + rows_in + _TITLE_IN + _HEAD_IN
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
+    # Narrow panels stand in the middle of what is left for them.
+    spare = (bars_left - _LEFT_IN - columns * (width + _GAP_IN)) / 2
+
+    def axes_at(left: float, bottom: float, width: float, height: float, **shared: Any) -> Axes:
+        place = (left / WIDTH_IN, bottom / height_in, width / WIDTH_IN, height / height_in)
+        return figure.add_axes(place, **shared)
+
+    grid: list[Axes] = []
+    for number in range(count):
+        row, column = divmod(number, columns)
+        is_lowest, is_leftmost = number + columns >= count, column == 0
+        axes = axes_at(
+            _LEFT_IN + spare + column * (width + _GAP_IN),
+            _BELOW_IN + (rows - 1 - row) * (height + _TITLE_IN),
+            width,
+            height,
+            **({"sharex": grid[0], "sharey": grid[0]} if grid else {}),
+        )
+        axes.set(aspect="equal", xlim=(0, map_width), ylim=(0, map_height))
         axes.set(xlabel="x, m" if is_lowest else "", ylabel="y, m" if is_leftmost else "")
         axes.locator_params(nbins=9, steps=[1, 2, 5, 10])
-        axes.tick_params(labelsize=9, labelbottom=is_lowest)
-    return figure, grid[:count]
+        axes.tick_params(labelsize=9, labelbottom=is_lowest, labelleft=is_leftmost)
+        grid.append(axes)
+    right = WIDTH_IN - _BAR_IN * num_bars - spare
+    bars = [axes_at(right + _BAR_IN * i, _BELOW_IN, 0.14, rows_in) for i in range(num_bars)]
+    return figure, grid, bars
 
 
 def _draw_path(axes: Axes, poses: Floats, weights: Floats | None, *, reached: bool) -> None:
@@ -234,4 +267,4 @@ def _add_legend(figure: Figure, goal_radius: float, *, any_failure: bool) -> Non
         Patch(fc=UNREACHABLE, label="no path to the goal"),
     ]
     options: dict[str, Any] = {"ncols": len(handles), "frameon": False, "columnspacing": 1.4}
-    figure.legend(handles=handles, loc="outside lower center", fontsize=9, **options)
+    figure.legend(handles=handles, loc="lower center", fontsize=9, **options)

@@ -99,7 +99,8 @@ def test_every_setting_is_an_option_with_dashes_or_underscores(
             options = [f"--{name}", str(new)]
         if name == "method":  # Whose own setting has to fit.
             options += ["--replay.capacity", "256"]
-        for spelled in (options[0], options[0].replace("_", "-")):
+        option, *value = options[0].partition("=")
+        for spelled in (options[0], "".join([option.replace("_", "-"), *value])):
             assert main(["train", spelled, *options[1:]]) == 0, name
             config, _, _ = started.pop()
             assert configs.flat(configs.to_dict(config))[name] == new
