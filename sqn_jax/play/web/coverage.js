@@ -6,6 +6,12 @@
  * To draw it: for each `index` with `seen[index]`, a square of side `cell` m around `place(index)`, turned
  * by `angle`. `fresh` lists the indices that the last scan has added.
  */
+
+/** Direction of the lattice's rows, rad: its tangent is the golden ratio, so that no wall runs along them. */
+export const LATTICE_ANGLE = Math.atan((Math.sqrt(5) - 1) / 2);
+const LATTICE_COSINE = Math.cos(LATTICE_ANGLE);
+const LATTICE_SINE = Math.sin(LATTICE_ANGLE);
+
 export class Coverage {
   /**
    * @param {number} width of the map, m
@@ -13,23 +19,40 @@ export class Coverage {
    * @param {{coverage_cell: number, max_range: number, field_of_view_deg: number}} settings
    */
   constructor(width, height, settings) {
-    throw new Error('to come');
+    this.width = width;
+    this.height = height;
+    this.maxRange = settings.max_range;
+    this.fieldOfView = (settings.field_of_view_deg * Math.PI) / 180;
     /** @type {number} distance of neighboring points, m */
-    this.cell = 0;
+    this.cell = settings.coverage_cell;
     /** @type {number} direction of the lattice's rows on the map, rad */
-    this.angle = 0;
+    this.angle = LATTICE_ANGLE;
+    const corners = [[0, 0], [width, 0], [0, height], [width, height]].map(([x, y]) => this.locate(x, y));
+    const us = corners.map(([u]) => u);
+    const vs = corners.map(([, v]) => v);
+    /** @type {number} column and row of the first point, counted from the map's corner */
+    [this.left, this.bottom] = [Math.floor(Math.min(...us)), Math.floor(Math.min(...vs))];
     /** @type {number} points in a row */
-    this.columns = 0;
+    this.columns = Math.ceil(Math.max(...us)) - this.left + 1;
     /** @type {number} rows */
-    this.rows = 0;
+    this.rows = Math.ceil(Math.max(...vs)) - this.bottom + 1;
     /** @type {Uint8Array} 1 for the points seen, `row * columns + column` */
-    this.seen = new Uint8Array();
+    this.seen = new Uint8Array(this.columns * this.rows);
     /** @type {number[]} indices of the points that the last scan saw first */
     this.fresh = [];
+    this.count = 0;
+    this.onMap = this.seen.map((_, index) => {
+      const [x, y] = this.place(index);
+      return Number(x >= 0 && x < width && y >= 0 && y < height);
+    });
   }
 
   /** Forget all that was seen. */
-  reset() {}
+  reset() {
+    this.seen.fill(0);
+    this.fresh = [];
+    this.count = 0;
+  }
 
   /**
    * Mark what a scan sees.
@@ -37,16 +60,50 @@ export class Coverage {
    * @param {Float64Array} ranges true readings, m, from the rightmost beam to the leftmost
    * @returns {number} newly seen area, m2
    */
-  addScan(pose, ranges) {}
+  addScan(pose, ranges) {
+    const [u, v] = this.locate(pose[0], pose[1]);
+    const reach = this.maxRange / this.cell;
+    const lastBeam = ranges.length - 1;
+    const halfView = this.fieldOfView / 2;
+    const heading = pose[2] - this.angle;
+    const clip = (value, first, count) => Math.min(Math.max(value - first, 0), count - 1);
+    const top = clip(Math.floor(v + reach), this.bottom, this.rows);
+    const right = clip(Math.floor(u + reach), this.left, this.columns);
+    this.fresh = [];
+    for (let row = clip(Math.ceil(v - reach), this.bottom, this.rows); row <= top; row += 1) {
+      for (let column = clip(Math.ceil(u - reach), this.left, this.columns); column <= right; column += 1) {
+        const index = row * this.columns + column;
+        if (this.seen[index] || !this.onMap[index]) continue;
+        const [du, dv] = [column + this.left - u, row + this.bottom - v];
+        const squaredDistance = du * du + dv * dv;
+        if (squaredDistance > reach * reach) continue;
+        const angle = wrapAngle(Math.atan2(dv, du) - heading);
+        if (Math.abs(angle) > halfView) continue;
+        const beam = Math.round((angle / this.fieldOfView + 0.5) * lastBeam);
+        const reading = ranges[beam] / this.cell;
+        if (squaredDistance <= reading * reading) this.fresh.push(index);
+      }
+    }
+    for (const index of this.fresh) this.seen[index] = 1;
+    this.count += this.fresh.length;
+    return this.fresh.length * this.cell ** 2;
+  }
 
   /** @returns {number} seen area, m2 */
-  area() {}
+  area() {
+    return this.count * this.cell ** 2;
+  }
 
   /**
    * @param {number} index of a point
    * @returns {number[]} x m, y m on the map
    */
-  place(index) {}
+  place(index) {
+    const column = index % this.columns;
+    const u = (column + this.left) * this.cell;
+    const v = ((index - column) / this.columns + this.bottom) * this.cell;
+    return [LATTICE_COSINE * u - LATTICE_SINE * v, LATTICE_COSINE * v + LATTICE_SINE * u];
+  }
 
   /**
    * Whether the point nearest to a place was seen.
@@ -54,5 +111,30 @@ export class Coverage {
    * @param {number} y m
    * @returns {boolean}
    */
-  isSeen(x, y) {}
+  isSeen(x, y) {
+    const [u, v] = this.locate(x, y);
+    const [column, row] = [Math.round(u) - this.left, Math.round(v) - this.bottom];
+    const inside = column >= 0 && row >= 0 && column < this.columns && row < this.rows;
+    return inside && this.seen[row * this.columns + column] === 1;
+  }
+
+  /**
+   * A place in the frame of the lattice.
+   * @param {number} x m
+   * @param {number} y m
+   * @returns {number[]} column and row, counted from the map's corner
+   */
+  locate(x, y) {
+    const u = (LATTICE_COSINE * x + LATTICE_SINE * y) / this.cell;
+    return [u, (LATTICE_COSINE * y - LATTICE_SINE * x) / this.cell];
+  }
+}
+
+/**
+ * @param {number} angle rad
+ * @returns {number} the angle in -pi..pi, pi left out
+ */
+export function wrapAngle(angle) {
+  const turns = (angle + Math.PI) / (2 * Math.PI);
+  return (turns - Math.floor(turns)) * 2 * Math.PI - Math.PI;
 }

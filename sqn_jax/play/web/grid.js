@@ -82,7 +82,29 @@ export class Grid {
    * @returns {number[]}
    */
   strokeCells(from, to, thickness) {
-    throw new Error('to come');
+    const reach = thickness / 2 / this.resolution;
+    const [x, y] = from.map((meters) => meters / this.resolution);
+    const [dx, dy] = [to[0] / this.resolution - x, to[1] / this.resolution - y];
+    const squaredLength = dx * dx + dy * dy;
+    const cells = new Set();
+    // Points of the line half a cell apart, so that a thin one has no gaps.
+    const points = Math.ceil(2 * Math.sqrt(squaredLength)) + 1;
+    for (let point = 0; point <= points; point += 1) {
+      const place = point / points;
+      const cell = this.cellAt(to[0] * place + from[0] * (1 - place), to[1] * place + from[1] * (1 - place));
+      if (cell >= 0) cells.add(cell);
+    }
+    const clip = (value, most) => Math.min(Math.max(Math.floor(value), 0), most - 1);
+    const right = clip(Math.max(x, x + dx) + reach, this.width);
+    const top = clip(Math.max(y, y + dy) + reach, this.height);
+    for (let row = clip(Math.min(y, y + dy) - reach, this.height); row <= top; row += 1) {
+      for (let column = clip(Math.min(x, x + dx) - reach, this.width); column <= right; column += 1) {
+        const [u, v] = [column + 0.5 - x, row + 0.5 - y];
+        const along = squaredLength > 0 ? Math.min(Math.max((u * dx + v * dy) / squaredLength, 0), 1) : 0;
+        if (Math.hypot(u - along * dx, v - along * dy) <= reach) cells.add(row * this.width + column);
+      }
+    }
+    return [...cells];
   }
 
   /**
@@ -92,7 +114,27 @@ export class Grid {
    * @returns {Uint8Array} 1 where it may not
    */
   blockedFor(radius) {
-    throw new Error('to come');
+    const { width, height, occupied } = this;
+    const blocked = occupied.slice();
+    // The same slack as in Python: 0.15 / 0.05 is not exactly 3.
+    const reach = radius / this.resolution - 1e-6;
+    const offsets = closeOffsets(reach);
+    const margin = Math.max(0, Math.ceil(reach + 0.5) - 1);
+    for (let cell = 0; cell < occupied.length; cell += 1) {
+      if (!occupied[cell]) continue;
+      const column = cell % width;
+      const row = (cell - column) / width;
+      const inside = column > 0 && row > 0 && column < width - 1 && row < height - 1;
+      const around = occupied[cell - 1] + occupied[cell + 1] + occupied[cell - width] + occupied[cell + width];
+      // Whatever is near to a cell among occupied ones is nearer to one of these.
+      if (inside && around === 4) continue;
+      const whole = column >= margin && row >= margin && column < width - margin && row < height - margin;
+      for (const [up, right] of offsets) {
+        const [y, x] = [row + up, column + right];
+        if (whole || (x >= 0 && y >= 0 && x < width && y < height)) blocked[y * width + x] = 1;
+      }
+    }
+    return blocked;
   }
 
   /**
@@ -102,7 +144,31 @@ export class Grid {
    *   blocked; the cells of each part, the first number is 0
    */
   components(blocked) {
-    throw new Error('to come');
+    const labels = new Int32Array(blocked.length);
+    const sizes = [0];
+    const stack = new Int32Array(blocked.length);
+    const { width } = this;
+    for (let seed = 0; seed < blocked.length; seed += 1) {
+      if (blocked[seed] || labels[seed]) continue;
+      const label = sizes.length;
+      let [size, waiting] = [1, 1];
+      labels[seed] = label;
+      stack[0] = seed;
+      while (waiting > 0) {
+        waiting -= 1;
+        const cell = stack[waiting];
+        // The border is blocked, so that no neighbor lies beyond it.
+        for (const neighbor of [cell - 1, cell + 1, cell - width, cell + width]) {
+          if (blocked[neighbor] || labels[neighbor]) continue;
+          labels[neighbor] = label;
+          stack[waiting] = neighbor;
+          waiting += 1;
+          size += 1;
+        }
+      }
+      sizes.push(size);
+    }
+    return { labels, sizes };
   }
 
   /** @returns {Grid} a copy with cells of its own. */
@@ -112,12 +178,33 @@ export class Grid {
   }
 }
 
+/** The offsets [up, right] of cells whose center is nearer than `reach` cells to the square of one at 0. */
+function closeOffsets(reach) {
+  const offsets = [];
+  const most = Math.ceil(reach + 0.5);
+  for (let up = -most; up <= most; up += 1) {
+    for (let right = -most; right <= most; right += 1) {
+      const [away, aside] = [Math.max(Math.abs(up) - 0.5, 0), Math.max(Math.abs(right) - 0.5, 0)];
+      if (Math.hypot(away, aside) < reach) offsets.push([up, right]);
+    }
+  }
+  return offsets;
+}
+
 /**
  * @param {MapData} data `name`, points and `max_steps` are not looked at
  * @returns {Grid}
  */
 export function unpackMap(data) {
-  throw new Error('to come');
+  const bytes = decodeBase64(data.cells);
+  const occupied = new Uint8Array(data.width * data.height);
+  if (bytes.length !== Math.ceil(occupied.length / 8)) {
+    throw new Error(`a map of ${data.width} x ${data.height} cells has ${bytes.length} bytes`);
+  }
+  for (let cell = 0; cell < occupied.length; cell += 1) {
+    occupied[cell] = (bytes[cell >> 3] >> (7 - (cell & 7))) & 1;
+  }
+  return new Grid(data.width, data.height, data.resolution, [...data.origin], occupied);
 }
 
 /**
@@ -125,5 +212,19 @@ export function unpackMap(data) {
  * @returns {string} what stands in `cells` of `MapData`
  */
 export function packMap(grid) {
-  throw new Error('to come');
+  const bytes = new Uint8Array(Math.ceil(grid.occupied.length / 8));
+  for (let cell = 0; cell < grid.occupied.length; cell += 1) {
+    bytes[cell >> 3] |= grid.occupied[cell] << (7 - (cell & 7));
+  }
+  let text = '';
+  for (const byte of bytes) text += String.fromCharCode(byte);
+  return btoa(text);
+}
+
+/**
+ * @param {string} text
+ * @returns {Uint8Array}
+ */
+export function decodeBase64(text) {
+  return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
 }

@@ -14,5 +14,24 @@
  * @returns {number} in cells
  */
 export function castRay(blocked, width, x, y, cosine, sine, limit) {
-  throw new Error('to come');
+  const [column, row] = [Math.floor(x), Math.floor(y)];
+  let cell = row * width + column;
+  if (blocked[cell]) return 0;
+  const [stepX, stepY] = [cosine < 0 ? -1 : 1, sine < 0 ? -width : width];
+  // How far it is from border to border along x and along y, and to the first of them.
+  const [gapX, gapY] = [1 / Math.abs(cosine), 1 / Math.abs(sine)];
+  let toX = cosine === 0 ? Infinity : (cosine < 0 ? x - column : column + 1 - x) * gapX;
+  let toY = sine === 0 ? Infinity : (sine < 0 ? y - row : row + 1 - y) * gapY;
+  for (;;) {
+    const traveled = toX < toY ? toX : toY;
+    if (traveled >= limit) return limit;
+    if (toX < toY) {
+      cell += stepX;
+      toX += gapX;
+    } else {
+      cell += stepY;
+      toY += gapY;
+    }
+    if (blocked[cell]) return traveled;
+  }
 }
