@@ -11,9 +11,10 @@ from pathlib import Path
 
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Run, gather_content, read_runs
-from sqn_jax.report.page import require_writable, to_html, write_page
+from sqn_jax.report.page import to_html
 from sqn_jax.report.pictures import draw_pictures
 from sqn_jax.storage.compile_cache import cached_programs
+from sqn_jax.storage.html import require_writable, write_page
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 

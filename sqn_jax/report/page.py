@@ -6,7 +6,6 @@ import base64
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import NEAR, WorstEpisode
 from sqn_jax.report.pictures import Illustration, Illustrations
-from sqn_jax.storage.files import NotWritten, probe_file, written_whole
 from sqn_jax.storage.run_folder import CONFIG
 
 _BASELINE_NAMES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
@@ -57,32 +55,6 @@ summary { cursor: pointer; margin: .6rem 0; }
   .scroll { overflow: visible; }
 }
 """
-
-
-def require_writable(path: Path) -> None:
-    """Refuse a file that could not be written, before any episode runs.
-
-    Raises:
-        ValueError: the name does not end in .html, or the file cannot be written.
-    """
-    if path.suffix != ".html":
-        raise ValueError(f"--out is {path}, expected a file ending in .html")
-    if not path.parent.is_dir() or path.is_dir():
-        raise ValueError(f"--out {path}: expected a file in an existing folder")
-    try:
-        probe_file(path)
-    except NotWritten as error:
-        raise ValueError(f"--out {error}") from None
-
-
-def write_page(path: Path, html: str) -> None:
-    """Write a page, all or nothing.
-
-    Raises:
-        ValueError: it cannot be written.
-    """
-    with written_whole(path) as partial:
-        partial.write_text(html, encoding="utf-8", errors="replace", newline="\n")
 
 
 def to_html(content: Content, pictures: Illustrations) -> str:

@@ -86,10 +86,11 @@ function stripOf(canvas, moments) {
  */
 export function drawSkills(canvas, moments, colors) {
   const { context, height, shown } = stripOf(canvas, moments);
+  const fills = colors.map((color) => mixed([color], [1]));
   shown.forEach(({ weights }, index) => {
     let bottom = height;
     for (let skill = 0; skill < weights.length; skill += 1) {
-      context.fillStyle = mixed([colors[skill % colors.length]], [1]);
+      context.fillStyle = fills[skill % fills.length];
       const size = weights[skill] * height;
       context.fillRect(index * PIXELS_PER_STEP, bottom - size, PIXELS_PER_STEP, size);
       bottom -= size;
@@ -142,11 +143,12 @@ export function drawRewards(canvas, moments) {
   const lowest = Math.min(-0.25, ...shown.map(({ reward }) => reward.total));
   const perUnit = height / (largest - lowest);
   const zero = height + lowest * perUnit;
+  const terms = ['navigation', 'exploration'].map((term) => [term, styleColor(term)]);
   shown.forEach(({ reward }, index) => {
     const left = index * PIXELS_PER_STEP;
     let bottom = zero;
-    for (const term of ['navigation', 'exploration']) {
-      context.fillStyle = styleColor(term);
+    for (const [term, color] of terms) {
+      context.fillStyle = color;
       const size = Math.max(0, reward[term]) * perUnit;
       context.fillRect(left, bottom - size, PIXELS_PER_STEP, size);
       bottom -= size;
@@ -180,7 +182,7 @@ export function skillKey(element, count) {
   });
   return (weights) => {
     values.forEach((value, skill) => {
-      value.textContent = weights ? weights[skill].toFixed(2) : '–';
+      value.textContent = `${skill + 1}: ${weights ? weights[skill].toFixed(2) : '–'}`;
     });
   };
 }

@@ -23,7 +23,7 @@
 
 const SEEN_PIXELS_PER_METER = 30;
 const SEEN_PIXELS_AT_MOST = 1024;
-const SMALLEST_ROBOT = 7; // Pixels of its radius.
+const SMALLEST_ROBOT = 8; // Pixels of its radius.
 const WEIGHT_LEVELS = 10;
 
 /**
