@@ -138,11 +138,14 @@ export class World {
   findPath() {
     this.path = undefined;
     clearTimeout(this.pathTimer);
-    this.pathTimer = setTimeout(() => {
-      this.path = pathOf(this.grid, this.task, this.settings);
-      if (!this.path) this.events.say(WALLED_OFF);
-      this.events.onName();
-    }, PATH_DELAY);
+    this.pathTimer = setTimeout(() => this.searchPath(), PATH_DELAY);
+  }
+
+  searchPath() {
+    clearTimeout(this.pathTimer);
+    this.path = pathOf(this.grid, this.task, this.settings);
+    if (!this.path) this.events.say(WALLED_OFF);
+    this.events.onName();
   }
 
   // Robots on their way.
@@ -170,15 +173,19 @@ export class World {
     }
     if (!this.episode.isOver) this.episode.advance();
     this.events.onScan();
-    if (this.isOver) this.events.say(this.verdict());
+    if (this.isOver) {
+      if (this.path === undefined) this.searchPath();
+      this.events.say(this.verdict());
+    }
     return true;
   }
 
   verdict() {
-    const said = (who, { outcome, env }) =>
-      outcome === 'reached'
-        ? `${who} reached the goal in ${env.steps} steps`
-        : `${who} did not reach the goal within ${env.steps} steps`;
+    const said = (who, { outcome, env }) => {
+      if (outcome !== 'reached') return `${who} did not reach the goal within ${env.steps} steps`;
+      const times = this.path ? ` (${(env.steps / this.path.steps).toFixed(2)} × shortest)` : '';
+      return `${who} reached the goal in ${env.steps} steps${times}`;
+    };
     if (!this.isManual) return `${said('The policy', this.episode)}.`;
     return `${said('You', this.manualEpisode)}, ${said('the policy', this.episode)}.`;
   }
