@@ -15,6 +15,8 @@ from sqn_jax.policies.run_policies import Policy
 PREFIX = "params/"
 """What the paths of all arrays begin with."""
 
+LARGEST = float(np.finfo(np.float16).max)
+
 
 def policy_data(policy: Policy) -> dict[str, Any]:
     """What `Policy` in `web/network.js` and `Env` in `web/env.js` are made from.
@@ -35,13 +37,13 @@ def policy_data(policy: Policy) -> dict[str, Any]:
     config = policy.config
     require_exportable(config, verb="played")
     arrays = flat_arrays(policy.params[0])
-    halves = {path: array.astype("<f2") for path, array in arrays.items()}
-    for path, half in halves.items():
-        if not np.isfinite(half).all():
+    for path, array in arrays.items():
+        if (largest := np.abs(array).max()) > LARGEST:
             raise ValueError(
-                f"policy {policy.name}: array {path} has a number of "
-                f"{np.abs(arrays[path]).max():g}, expected at most {np.finfo(np.float16).max:g}"
+                f"policy {policy.name}: array {path} has a number of {largest:g}, expected at most "
+                f"{LARGEST:g}"
             )
+    halves = {path: array.astype("<f2") for path, array in arrays.items()}
     return {
         "name": policy.name,
         "algo": config.algo,

@@ -63,8 +63,6 @@ export class Coverage {
   addScan(pose, ranges) {
     const [u, v] = this.locate(pose[0], pose[1]);
     const reach = this.maxRange / this.cell;
-    const lastBeam = ranges.length - 1;
-    const halfView = this.fieldOfView / 2;
     const heading = pose[2] - this.angle;
     const clip = (value, first, count) => Math.min(Math.max(value - first, 0), count - 1);
     const top = clip(Math.floor(v + reach), this.bottom, this.rows);
@@ -74,19 +72,29 @@ export class Coverage {
       for (let column = clip(Math.ceil(u - reach), this.left, this.columns); column <= right; column += 1) {
         const index = row * this.columns + column;
         if (this.seen[index] || !this.onMap[index]) continue;
-        const [du, dv] = [column + this.left - u, row + this.bottom - v];
-        const squaredDistance = du * du + dv * dv;
-        if (squaredDistance > reach * reach) continue;
-        const angle = wrapAngle(Math.atan2(dv, du) - heading);
-        if (Math.abs(angle) > halfView) continue;
-        const beam = Math.round((angle / this.fieldOfView + 0.5) * lastBeam);
-        const reading = ranges[beam] / this.cell;
-        if (squaredDistance <= reading * reading) this.fresh.push(index);
+        const isSeen = this.sees(column + this.left - u, row + this.bottom - v, heading, ranges);
+        if (isSeen) this.fresh.push(index);
       }
     }
     for (const index of this.fresh) this.seen[index] = 1;
     this.count += this.fresh.length;
     return this.fresh.length * this.cell ** 2;
+  }
+
+  /**
+   * Whether a scan sees a point.
+   * @param {number} du of the point from the robot, in the frame of the lattice, cells
+   * @param {number} dv
+   * @param {number} heading of the robot in that frame, rad
+   * @param {Float64Array} ranges m
+   * @returns {boolean}
+   */
+  sees(du, dv, heading, ranges) {
+    const distance = Math.sqrt(du * du + dv * dv) * this.cell;
+    if (distance > this.maxRange) return false;
+    const angle = wrapAngle(Math.atan2(dv, du) - heading);
+    if (Math.abs(angle) > this.fieldOfView / 2) return false;
+    return distance <= ranges[Math.round((angle / this.fieldOfView + 0.5) * (ranges.length - 1))];
   }
 
   /** @returns {number} seen area, m2 */

@@ -200,7 +200,8 @@ export class Env {
     const { grid } = this;
     const timeStep = single(this.settings.time_step);
     const [x, y, heading] = this.pose;
-    const turn = single(single(turnRate) * timeStep);
+    // Not rounded before the sum, which compiled code makes of it in one operation.
+    const turn = single(turnRate) * timeStep;
     // An arc is made; its chord is what is checked.
     const narrowing = turn === 0 ? 1 : single(Math.sin(turn / 2) / (turn / 2));
     const chord = single(single(single(speed) * timeStep) * narrowing);
