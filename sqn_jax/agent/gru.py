@@ -45,16 +45,16 @@ class GRU(nn.Module):
             "input_kernel", nn.initializers.lecun_normal(), (inputs.shape[-1], 3 * size)
         )
         input_bias = self.param("input_bias", nn.initializers.zeros, (3 * size,))
-        hidden_kernel = self.param("hidden_kernel", _orthogonal_gates, (size, 3 * size))
+        hidden_kernel = self.param("hidden_kernel", orthogonal_gates, (size, 3 * size))
         candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (size,))
         projected = affine(inputs, input_kernel, input_bias)
         hidden = scan_gru(projected, carry, hidden_kernel, candidate_bias)
         return hidden[-1], hidden
 
 
-def _orthogonal_gates(key: Array, shape: tuple[int, int]) -> Array:
-    """One orthogonal matrix for each of the three gates."""
-    keys = jax.random.split(key, 3)
+def orthogonal_gates(key: Array, shape: tuple[int, int]) -> Array:
+    """One orthogonal matrix for each gate [H, H] of a kernel of this shape, [H, gates H]."""
+    keys = jax.random.split(key, shape[1] // shape[0])
     return jnp.concatenate([_orthogonal(gate, shape[0]) for gate in keys], axis=1)
 
 

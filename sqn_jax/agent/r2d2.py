@@ -27,10 +27,11 @@ from sqn_jax.agent.trajectory import Trajectory
 
 @struct.dataclass
 class PackedEpisodes:
-    """Whole episodes as stored: robot-major, 81 bytes a step."""
+    """Whole episodes as stored: robot-major, 81 bytes a step, 87 with motion."""
 
     obs: Any
-    """`ranges` [N, T + 1, R] uint8, steps of 2 cm; `goal` [N, T + 1, G] uint16."""
+    """`ranges` [N, T + 1, R] uint8, steps of 2 cm; `goal` [N, T + 1, G] uint16; `motion`, where
+    there is any, [N, T + 1, A + 1] uint8, exact."""
     actions: Array
     """[N, T] uint8."""
     rewards: Array
@@ -39,14 +40,30 @@ class PackedEpisodes:
     """[N, T] bool."""
 
 
+_STEPS = {"ranges": 255, "goal": 65535, "motion": 1}
+"""Into how many steps the numbers 0..1 of each part of an observation are divided."""
+
+
+def _packed(obs: Any) -> Any:
+    def integers(name: str) -> Array:
+        steps = _STEPS[name]
+        dtype = jnp.uint8 if steps < 256 else jnp.uint16
+        return jnp.round(getattr(obs, name) * steps).astype(dtype)
+
+    return dataclasses.replace(obs, **{x.name: integers(x.name) for x in dataclasses.fields(obs)})
+
+
+def _unpacked(obs: Any) -> Any:
+    def numbers(name: str) -> Array:
+        return getattr(obs, name).astype(jnp.float32) / _STEPS[name]
+
+    return dataclasses.replace(obs, **{x.name: numbers(x.name) for x in dataclasses.fields(obs)})
+
+
 def pack(trajectory: Trajectory) -> PackedEpisodes:
     """Whole time-major episodes to compact items."""
     compact = PackedEpisodes(
-        obs=dataclasses.replace(
-            trajectory.obs,
-            ranges=jnp.round(trajectory.obs.ranges * 255).astype(jnp.uint8),
-            goal=jnp.round(trajectory.obs.goal * 65535).astype(jnp.uint16),
-        ),
+        obs=_packed(trajectory.obs),
         actions=trajectory.actions.astype(jnp.uint8),
         rewards=trajectory.rewards,
         terminated=trajectory.terminated,
@@ -58,11 +75,7 @@ def unpack(items: PackedEpisodes, hidden_size: int) -> Trajectory:
     """The inverse of `pack`, to the rounding of the integers; the recurrent state is zero."""
     compact = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), items)
     return Trajectory(
-        obs=dataclasses.replace(
-            compact.obs,
-            ranges=compact.obs.ranges.astype(jnp.float32) / 255,
-            goal=compact.obs.goal.astype(jnp.float32) / 65535,
-        ),
+        obs=_unpacked(compact.obs),
         actions=compact.actions.astype(jnp.int32),
         rewards=compact.rewards,
         terminated=compact.terminated,

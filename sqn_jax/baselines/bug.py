@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env.arithmetic import larger, smaller
-from sqn_jax.env.geometry import beam_angles, wrap_angle
+from sqn_jax.env.geometry import beam_angles, decode_goal, farthest_shown, wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
 from sqn_jax.env.params import Observation
 
@@ -231,16 +231,14 @@ class Bug:
         Returns:
             The memory, and the goal's distance, m, and bearing, rad.
         """
-        shown = self.config.max_goal_distance
-        distance = goal[0] * shown
-        if self.config.heading_encoding == "linear":
-            bearing = goal[1] * 2 * jnp.pi - jnp.pi
-        else:
-            bearing = jnp.arctan2(goal[1] * 2 - 1, goal[2] * 2 - 1)
+        shown = farthest_shown(self.config)
+        distance, bearing = decode_goal(goal, self.config)
         ray = _vector(jnp.float32(1), memory.turned * self.turn + bearing)
-        guess = jnp.where(jnp.isnan(memory.goal), memory.place + 1.2 * shown * ray, memory.goal)
-        far = larger(jnp.dot(guess - memory.place, ray), shown)
-        distance = jnp.where(goal[0] >= 1 - 1e-6, far, distance)
+        if math.isfinite(shown):
+            unknown = jnp.isnan(memory.goal)
+            guess = jnp.where(unknown, memory.place + 1.2 * shown * ray, memory.goal)
+            far = larger(jnp.dot(guess - memory.place, ray), shown)
+            distance = jnp.where(distance >= shown * (1 - 1e-6), far, distance)
         nearest = smaller(memory.nearest, distance)
         place = memory.place + distance * ray
         return replace(memory, goal=place, nearest=nearest), distance, bearing

@@ -39,6 +39,11 @@ class EnvConfig:
     """The goal counts as reached within this distance, m."""
     max_goal_distance: float = 24.0
     """Goal distance at which the normalized observation reaches 1, m (17 m x sqrt 2)."""
+    goal_distance_encoding: Literal["clipped", "rational"] = "clipped"
+    """Goal distance d as d / max_goal_distance, at most 1, or as d / (d + goal_distance_scale),
+    which tells any two distances apart."""
+    goal_distance_scale: float = 5.0
+    """rational: goal distance at which the observation is 1/2, m; here the range of the beams."""
     heading_encoding: Literal["linear", "sincos"] = "linear"
     """Goal heading as one number (psi + pi) / 2 pi, or as sine and cosine scaled to 0..1."""
     max_steps: int = 0
@@ -67,7 +72,8 @@ class EnvConfig:
     """Weight of the constant penalty of -1 a step (paper eq. 9)."""
 
     def __post_init__(self) -> None:
-        for name in ("max_range", "time_step", "goal_radius", "max_goal_distance", "coverage_cell"):
+        distances = ("max_range", "goal_radius", "max_goal_distance", "goal_distance_scale")
+        for name in (*distances, "time_step", "coverage_cell"):
             require_positive(self, "env", name)
         speeds_and_size = ("forward_speed", "backward_speed", "turn_rate", "robot_radius")
         for name in (*speeds_and_size, "velocity_noise", "range_noise"):
@@ -131,8 +137,14 @@ class NetworkConfig:
     """Layer normalization before each ReLU; recurrent PQN needs it, the paper has none."""
     dqn_width_factor: int = 3
     """How much wider the DQN's layers after the features are (paper section IV-D)."""
+    motion_inputs: bool = False
+    """The agent is also told its last action, and whether that was a move that was refused."""
+    cell: Literal["gru", "refined_gru"] = "gru"
+    """sqn, r2d2: the recurrent unit; the refined one scales its candidate by the input and learns
+    how its update gate saturates."""
 
     def __post_init__(self) -> None:
+        require_known_choices(self, "network")
         for name in ("hidden_size", "num_skills", "dqn_width_factor"):
             value = getattr(self, name)
             require(value >= 1, f"network.{name}", value, "at least 1")

@@ -24,6 +24,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "env.max_range": (1e-6, 1e6),
     "env.coverage_cell": (1e-3, 1e6),
     "env.max_goal_distance": (1e-6, 1e6),
+    "env.goal_distance_scale": (1e-3, 1e6),  # Below, single precision rounds distances to 1.
     "env.velocity_noise": (0, 1e6),
     "env.range_noise": (0, 1e6),
     "env.forward_speed": (0, 1e6),

@@ -30,7 +30,7 @@ from sqn_jax.env.arguments import (
     require_state,
 )
 from sqn_jax.env.dynamics import move
-from sqn_jax.env.geometry import beam_angles, goal_in_robot_frame
+from sqn_jax.env.geometry import beam_angles, encode_distance, goal_in_robot_frame
 from sqn_jax.env.params import EnvParams, EnvState, Observation
 from sqn_jax.env.raycast import cast_fan
 
@@ -169,7 +169,7 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
     if params.mirrored is not None:
         ranges = jnp.where(params.mirrored, ranges[::-1], ranges)
         heading = jnp.where(params.mirrored, -heading, heading)
-    scaled_distance = jnp.clip(distance / config.max_goal_distance, 0.0, 1.0)
+    scaled_distance = encode_distance(distance, config)
     if config.heading_encoding == "linear":
         goal = jnp.stack([scaled_distance, (heading + jnp.pi) / (2 * jnp.pi)])
     else:

@@ -85,5 +85,5 @@ class Observation:
     ranges: Array
     """[R] readings over the maximal range, from the rightmost beam to the leftmost."""
     goal: Array
-    """[2] goal distance over `max_goal_distance`, clipped, and heading (psi + pi) / 2 pi; or
+    """[2] goal distance as `geometry.encode_distance` has it and heading (psi + pi) / 2 pi; or
     [3] distance, (1 + sin psi) / 2, (1 + cos psi) / 2 with `heading_encoding="sincos"`."""

@@ -18,7 +18,7 @@ from flax import struct
 from jax import Array
 from numpy.typing import NDArray
 
-from sqn_jax.agent.networks import Params, QNetwork, initial_carry
+from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.agent.trajectory import Trajectory, over_robots
 from sqn_jax.env import EnvParams, EnvState, Observation, reset_to, sample_task
 from sqn_jax.env.randomize import robot_axes
@@ -27,6 +27,7 @@ from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
     RandomDraws,
+    before_first_action,
     episode_metrics,
     random_draws,
     step_actors,
@@ -78,9 +79,9 @@ def _start_key(key: Array) -> Array:
 
 
 def _start_episodes(
-    keys: Array, starts: Array, goals: Array, carry: Array, env_params: EnvParams
-) -> tuple[RandomDraws, ActorState]:
-    """Start the episodes of these keys: the random draws of their steps, and the first state.
+    keys: Array, starts: Array, goals: Array, env_params: EnvParams
+) -> tuple[RandomDraws, Observation, EnvState]:
+    """Start the episodes of these keys: the random draws of their steps, and what is before them.
 
     All follows from an episode's own key, so policies that get the same keys and the same world
     have the same tasks and the same noise.
@@ -89,11 +90,10 @@ def _start_episodes(
         keys: [E] from `episode_keys`.
         starts: [E, 3] x m, y m, heading rad; a heading that is NaN is drawn.
         goals: [E, 2] x m, y m.
-        carry: [E, H] the initial carry.
         env_params: the world, or that of each robot.
 
     Returns:
-        The random draws [T, E], and the actor state with the first observations.
+        The random draws [T, E], the first observations and the states of the env, [E, ...].
     """
 
     def draws_of(key: Array) -> RandomDraws:
@@ -111,7 +111,7 @@ def _start_episodes(
     draws = jax.vmap(draws_of, out_axes=1)(keys)
     begin_all = jax.vmap(begin, in_axes=(0, 0, 0, robot_axes(env_params)))
     obs, env_state = begin_all(keys, starts, goals, env_params)
-    return draws, ActorState(obs, env_state, carry)
+    return draws, obs, env_state
 
 
 class EpisodeResults(NamedTuple):
@@ -256,8 +256,8 @@ def _run_batch(
     """For each policy of params [S, ...] the trajectory of E robots and their starts [E, 3]."""
     if maps is not None:
         world = select_maps(world, maps)
-    carry = initial_carry(network.config, len(keys))
-    draws, actors = _start_episodes(keys, starts, goals, carry, world)
+    draws, obs, env_state = _start_episodes(keys, starts, goals, world)
+    actors = before_first_action(obs, env_state, network)
     epsilons = jnp.full(len(keys), epsilon, jnp.float32)
 
     def run(params: Params) -> Trajectory:
@@ -324,9 +324,8 @@ def start_by_hand(
 def _start_by_hand(
     keys: Array, starts: Array, goals: Array, world: EnvParams
 ) -> tuple[Array, ActorState]:
-    carry = jnp.zeros((len(keys), 0))
-    draws, actors = _start_episodes(keys, starts, goals, carry, world)
-    return draws.step_keys, actors
+    draws, obs, env_state = _start_episodes(keys, starts, goals, world)
+    return draws.step_keys, ActorState(obs, env_state, carry=jnp.zeros((len(keys), 0)))
 
 
 @jax.jit

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, EnvState, Observation, make_env, reset, step
+from sqn_jax.env.geometry import decode_goal
 from sqn_jax.policies.greedy import GreedyPolicy, step_network
 from sqn_jax.training.state import network_of
 
@@ -64,11 +65,7 @@ def in_si_units(obs: Observation, env: EnvConfig) -> NDArray[np.float32]:
     """What a robot's sensors give where the network sees `obs` [T, ...]: [T, R + 2] m, m, rad."""
     ranges, goal = np.asarray(obs.ranges, np.float64), np.asarray(obs.goal, np.float64)
     readings = np.where(ranges < 1, ranges * env.max_range, np.inf)
-    if env.heading_encoding == "linear":
-        heading = goal[:, 1] * 2 * np.pi - np.pi
-    else:
-        heading = np.arctan2(2 * goal[:, 1] - 1, 2 * goal[:, 2] - 1)
-    distance = goal[:, 0] * env.max_goal_distance
+    distance, heading = decode_goal(goal, env)
     return np.column_stack([readings, distance, heading]).astype(np.float32)
 
 

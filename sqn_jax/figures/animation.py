@@ -24,6 +24,9 @@ from sqn_jax.storage.files import written_whole
 
 Frame = NDArray[np.uint8]
 
+DEFAULT_FRAMES = 160
+"""The largest number of frames: 8 s at 20 a second."""
+
 LAST_FRAME_MS = 1_000
 """Duration of the last frame, so that the end can be seen before a GIF repeats."""
 
@@ -35,7 +38,9 @@ UNCHANGED = 255
 pixels take hardly any space."""
 
 
-def frames(episode: Episode, *, count: int = 240, width_px: int = 800) -> Iterator[Frame]:
+def frames(
+    episode: Episode, *, count: int = DEFAULT_FRAMES, width_px: int = 800
+) -> Iterator[Frame]:
     """Draw an animation of an episode, from its start until 2 s after the arrival.
 
     Without success the whole episode is shown. The frames are evenly spaced steps, or all steps if
@@ -54,10 +59,10 @@ def frames(episode: Episode, *, count: int = 240, width_px: int = 800) -> Iterat
     """
     steps = shown_steps(episode, count)
     screen = Screen(episode, *frame_size(width_px))
-    return (screen.draw(int(step)) for step in steps)
+    return (screen.draw(int(step))[..., :3] for step in steps)
 
 
-def shown_steps(episode: Episode, count: int = 240) -> NDArray[np.intp]:
+def shown_steps(episode: Episode, count: int = DEFAULT_FRAMES) -> NDArray[np.intp]:
     """The indices 0..T of the states in an animation of at most `count` frames.
 
     Raises:
@@ -70,7 +75,11 @@ def shown_steps(episode: Episode, count: int = 240) -> NDArray[np.intp]:
 
 
 def gif(
-    episode: Episode, *, count: int = 240, frames_per_second: int = 20, width_px: int = 800
+    episode: Episode,
+    *,
+    count: int = DEFAULT_FRAMES,
+    frames_per_second: int = 20,
+    width_px: int = 800,
 ) -> bytes:
     """An animated GIF that repeats; the last frame is shown for a second.
 
@@ -127,7 +136,7 @@ def mp4(
     path: str | Path,
     episode: Episode,
     *,
-    count: int = 240,
+    count: int = DEFAULT_FRAMES,
     frames_per_second: int = 20,
     width_px: int = 800,
 ) -> None:
@@ -218,7 +227,7 @@ class _Palette:
 
     def __init__(self, samples: list[Frame]) -> None:
         key_colors = np.unique([rgb(color) for color in KEY_COLORS], axis=0)
-        stacked = Image.fromarray(np.concatenate(samples))
+        stacked = Image.fromarray(np.concatenate(samples)[..., :3])
         others = stacked.quantize(UNCHANGED - len(key_colors), Image.Quantize.MEDIANCUT)
         other_colors = np.asarray(others.getpalette(), np.uint8).reshape(-1, 3)
         table = np.concatenate([key_colors, other_colors])[:UNCHANGED]
@@ -228,16 +237,15 @@ class _Palette:
         self._cache = np.full(2**24, -1, np.int16)
 
     def indices(self, frame: Frame) -> Frame:
-        """[h, w] uint8, the nearest color of the palette for each pixel.
+        """[h, w] uint8, the nearest color of the palette for each pixel [h, w, 4] RGBA.
 
         Not with Pillow, which does not always find the nearest. The result is cached by color.
         """
-        red, green, blue = np.moveaxis(frame.astype(np.int32), -1, 0)
-        codes = red << 16 | green << 8 | blue
+        codes = frame.view("<u4")[..., 0] & 0xFFFFFF
         indices = self._cache[codes]
         if (indices < 0).any():
             new = np.unique(codes[indices < 0])
-            colors = np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1)
+            colors = np.stack([new & 255, new >> 8 & 255, new >> 16], axis=-1)
             self._cache[new] = self._tree.query(colors)[1]
             indices = self._cache[codes]
         return indices.astype(np.uint8)

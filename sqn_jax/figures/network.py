@@ -203,6 +203,12 @@ def _draw_perception(axes: Axes, modules: Tree, middle: float) -> _Box:
             axes, (box.right, box.middle), (between, box.middle), (between, middle),
             (perception.left, middle),
         )  # fmt: skip
+    kernel = modules["perception"]["input_kernel" if is_recurrent else "kernel"]
+    motion = kernel.shape[0] - sum([*_layers(x).values()][-1][-1] for x in features.values())
+    if motion:
+        right = _FEATURES + _BOX_WIDTH
+        _draw_note(axes, (_FEATURES + right) / 2, middle, f"last motion {motion}")
+        _draw_arrow(axes, (right, middle), (perception.left, middle))
     if is_recurrent:
         left, right, above = perception.left + 0.3, perception.right - 0.3, perception.top + 0.22
         _draw_arrow(

@@ -104,7 +104,7 @@ class Screen:
         self._background = self._pixels.copy()
 
     def draw(self, index: int) -> NDArray[np.uint8]:
-        """The frame [h, w, 3] for the state before step `index` (0..T)."""
+        """The frame [h, w, 4] RGBA for the state before step `index` (0..T)."""
         self._update_map(index)
         self._update_view(index)
         self._update_skills(index)
@@ -114,15 +114,15 @@ class Screen:
         top, left = self.map_corner
         mask = self._seen(index)
         rows, columns = mask.shape
-        panel = self._pixels[top : top + rows, left : left + columns, :3]
-        panel[:] = np.where(mask[..., None], self._tinted, self._unseen)
+        panel = self._pixels.view(np.uint32)[top : top + rows, left : left + columns, 0]
+        panel[:] = np.where(mask, self._tinted, self._unseen)
         renderer = self._canvas.get_renderer()
         for axes, artist in self._moving:
             if axes is None:
                 artist.draw(renderer)
             else:
                 axes.draw_artist(artist)
-        return self._pixels[..., :3].copy()
+        return self._pixels.copy()
 
     # ---------------------------------------------------------------------------------------- map
 
@@ -171,7 +171,7 @@ class Screen:
         self._draw_legend(box_px)
 
     def _map_pixels(self, rows: int, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The map [rows, columns, 3] uint8 with nothing seen, and with everything seen.
+        """The map [rows, columns] RGBA in 32 bits with nothing seen, and with everything seen.
 
         A pixel is as dark as its fraction of obstacles, so that thin walls do not vanish.
         """
@@ -183,10 +183,12 @@ class Screen:
         )
         samples = occupied[y[::-1]][:, x].reshape(rows, fine, columns, fine)
         fraction = samples.mean(axis=(1, 3))[..., None]
-        unseen, tinted = (
-            np.rint(fraction * rgb(OBSTACLE) + (1 - fraction) * rgb(ground)).astype(np.uint8)
-            for ground in (FREE, SEEN)
-        )
+        opaque = np.full((rows, columns, 4), 255, np.uint8)
+        pictures = []
+        for ground in (FREE, SEEN):
+            opaque[..., :3] = np.rint(fraction * rgb(OBSTACLE) + (1 - fraction) * rgb(ground))
+            pictures.append(opaque.view(np.uint32)[..., 0].copy())
+        unseen, tinted = pictures
         return unseen, tinted
 
     def _seen(self, index: int) -> NDArray[np.bool_]:

@@ -40,7 +40,8 @@ class GreedyPolicy:
         """Choose an action.
 
         Args:
-            obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot.
+            obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot; for a policy with
+                `network.motion_inputs` what `training.motion` makes of it.
             carry: [H] from `start` or the step before.
 
         Returns:
@@ -53,7 +54,15 @@ class GreedyPolicy:
         """The next carry [H] and all that the network says of an observation, without batch axes.
 
         See `act`.
+
+        Raises:
+            ValueError: the policy looks at its last action, and `obs` does not tell it.
         """
+        if self.config.network.motion_inputs and not hasattr(obs, "motion"):
+            raise ValueError(
+                f"policy {self.name} has network.motion_inputs, expected a MotionObservation: "
+                "see sqn_jax.training.motion"
+            )
         return cast(
             tuple[Array, QOutput], step_network(self.params, obs, carry, network_of(self.config))
         )

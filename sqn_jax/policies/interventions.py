@@ -1,8 +1,9 @@
 """Changing what a trained SQN decides between its skills, to see what each of them does.
 
 `fix_skill_weights` and `swap_skills` return a policy of the same form with other parameters in the
-last layer of the skill decision (paper eq. 4), `single_head` one of the R2D2 agent: each can be
-evaluated, recorded and drawn like any other, and training can start from it.
+last layer of the skill decision (paper eq. 4), `single_head` one of the R2D2 agent,
+`with_motion_inputs` one that could look at its last action: each can be evaluated, recorded and
+drawn like any other, and training can start from it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.motion import MOTION_SIZE
 
 
 def fix_skill_weights(policy: Policy, weights: Sequence[float]) -> Policy:
@@ -90,6 +92,27 @@ def single_head(policy: Policy, skill: int = 0) -> Policy:
 
     config = dataclasses.replace(policy.config, algo="r2d2")
     return Policy(policy.name, config, tuple(reduced(params) for params in policy.params))
+
+
+def with_motion_inputs(policy: Policy) -> Policy:
+    """The policy with `network.motion_inputs`, whose weights are zero: it does what it did.
+
+    Args:
+        policy: of any agent; one that has the inputs is returned as it is.
+    """
+    if policy.config.network.motion_inputs:
+        return policy
+
+    def widened(params: Any) -> Any:
+        modules = params["params"]
+        perception = modules["perception"]
+        name = "kernel" if policy.config.algo == "dqn" else "input_kernel"
+        kernel = jnp.pad(perception[name], ((0, MOTION_SIZE), (0, 0)))
+        return {**params, "params": {**modules, "perception": {**perception, name: kernel}}}
+
+    network = dataclasses.replace(policy.config.network, motion_inputs=True)
+    config = dataclasses.replace(policy.config, network=network)
+    return Policy(policy.name, config, tuple(widened(params) for params in policy.params))
 
 
 def _num_skills(policy: Policy) -> int:

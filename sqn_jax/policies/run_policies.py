@@ -129,7 +129,7 @@ def require_same_network(policy: Policy, config: TrainConfig) -> None:
         ValueError: the policy is of another network, or sees other observations.
     """
     theirs, ours = (configs.flat(configs.to_dict(run)) for run in (policy.config, config))
-    decisive = ["algo", "env.num_beams", "env.heading_encoding"]
+    decisive = ["algo", "env.num_beams", "env.heading_encoding", "env.goal_distance_encoding"]
     decisive += [name for name in ours if name.startswith("network.")]
     for name in decisive:
         if theirs[name] != ours[name]:

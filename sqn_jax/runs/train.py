@@ -25,6 +25,7 @@ from sqn_jax.env import EnvParams, make_env
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.outside.messages import say
 from sqn_jax.outside.reading import read_at_most
+from sqn_jax.policies.interventions import with_motion_inputs
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation, streams
@@ -156,6 +157,8 @@ def _starting_policy(config: TrainConfig) -> Policy | None:
     if not config.start_from:
         return None
     policy = find_policy(config.start_from)
+    if config.network.motion_inputs:
+        policy = with_motion_inputs(policy)
     require_same_network(policy, config)
     return policy
 

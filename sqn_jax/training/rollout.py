@@ -19,6 +19,7 @@ from sqn_jax.config import RandomizationConfig
 from sqn_jax.env import navigation
 from sqn_jax.env.params import EnvParams, EnvState, Observation
 from sqn_jax.env.randomize import randomized, robot_axes, robots_own
+from sqn_jax.training.motion import first_observation, next_observation
 
 
 @struct.dataclass
@@ -26,7 +27,7 @@ class ActorState:
     """N robots within their episodes: what an unroll starts from and leaves behind."""
 
     obs: Observation
-    """[N, ...] what they see now."""
+    """[N, ...] what they see now; with `network.motion_inputs` a `MotionObservation`."""
     env_state: EnvState
     """[N, ...] where they are."""
     carry: Array
@@ -44,8 +45,13 @@ def own_worlds(
 
 def start_actors(keys: Array, env_params: EnvParams, network: QNetwork) -> ActorState:
     """Start an episode for each of the keys [N], which are consumed."""
-    carry = initial_carry(network.config, keys.shape[0])
-    return ActorState(*reset_robots(keys, env_params), carry)
+    return before_first_action(*reset_robots(keys, env_params), network)
+
+
+def before_first_action(obs: Observation, env_state: EnvState, network: QNetwork) -> ActorState:
+    """N robots at the start of their tasks, by what the env shows [N, ...]: nothing lies behind."""
+    carry = initial_carry(network.config, obs.goal.shape[0])
+    return ActorState(first_observation(obs, network.config), env_state, carry)
 
 
 def reset_robots(keys: Array, env_params: EnvParams) -> tuple[Observation, EnvState]:
@@ -156,6 +162,7 @@ def step_actors(
         poses=actors.env_state.pose,
         info=info,
     )
+    obs = next_observation(actors.obs, obs, actions, info["collision"])
     return dataclasses.replace(actors, obs=obs, env_state=env_state), taken
 
 

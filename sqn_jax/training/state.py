@@ -18,9 +18,10 @@ from sqn_jax.agent.program import Program
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shards import AXIS
 from sqn_jax.agent.trajectory import Trajectory
-from sqn_jax.config import EnvConfig, TrainConfig
+from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
 from sqn_jax.training.devices import REPLICATED
+from sqn_jax.training.motion import first_observation
 
 MAX_SKILLS = 256
 """Skills of a network: each is a module of its own in the program."""
@@ -46,16 +47,17 @@ def init_runner(key: Array, program: Program) -> RunnerState:
     memory = None
     if program.config.method == "r2d2":
         memory = r2d2.init_memory(trajectory_shapes(program), program)
-    learner = init_learner(learner_key, example_obs(program.config.env), program, memory)
+    learner = init_learner(learner_key, example_obs(program.config), program, memory)
     return RunnerState(learner=learner, key=run_key)
 
 
-def example_obs(config: EnvConfig) -> Observation:
-    """Zeros in the shape of an observation of one step of one robot, [1, 1, ...]."""
-    goal_size = 2 if config.heading_encoding == "linear" else 3
-    return Observation(
-        ranges=jnp.zeros((1, 1, config.num_beams)), goal=jnp.zeros((1, 1, goal_size))
+def example_obs(config: TrainConfig) -> Observation:
+    """Zeros in the shape of what the network sees of one step of one robot, [1, 1, ...]."""
+    goal_size = 2 if config.env.heading_encoding == "linear" else 3
+    obs = Observation(
+        ranges=jnp.zeros((1, 1, config.env.num_beams)), goal=jnp.zeros((1, 1, goal_size))
     )
+    return first_observation(obs, config.network)
 
 
 def network_of(config: TrainConfig) -> QNetwork:
@@ -72,7 +74,7 @@ def params_shapes(config: TrainConfig) -> Params:
         ValueError: the network is larger than any that is trained here.
     """
     _require_sensible(config)
-    obs, carry = example_obs(config.env), initial_carry(config.network, 1)
+    obs, carry = example_obs(config), initial_carry(config.network, 1)
     shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
     seeds = () if config.num_seeds == 1 else (config.num_seeds,)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)
@@ -107,7 +109,7 @@ def trajectory_shapes(program: Program) -> Trajectory:
     steps = (length, config.num_envs)
     obs = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((length + 1, config.num_envs, *x.shape[2:]), x.dtype),
-        jax.eval_shape(partial(example_obs, config.env)),
+        jax.eval_shape(partial(example_obs, config)),
     )
     return Trajectory(
         obs=obs,

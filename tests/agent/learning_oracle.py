@@ -60,6 +60,25 @@ def projected_gru_step(
     return (1 - update) * candidate + update * hidden
 
 
+def refined_gru_step(
+    projected: FLOATS, hidden: FLOATS, hidden_kernel: FLOATS, candidate_bias: FLOATS
+) -> FLOATS:
+    """One step of the unit with a refined gate and a scaled candidate, number by number."""
+    size = len(hidden)
+    new = np.zeros(size)
+    for k in range(size):
+        r, z, i, n, s = (projected[gate * size + k] for gate in range(5))
+        from_r, from_z, from_i, from_n = (
+            sum(hidden[j] * hidden_kernel[j, gate * size + k] for j in range(size))
+            for gate in range(4)
+        )
+        reset, update, refine = sigmoid(r + from_r), sigmoid(z + from_z), sigmoid(i + from_i)
+        candidate = np.tanh(s * (n + reset * (from_n + candidate_bias[k])))
+        gate = refine * (1 - (1 - update) ** 2) + (1 - refine) * update**2
+        new[k] = (1 - gate) * candidate + gate * hidden[k]
+    return new
+
+
 @dataclass
 class Outputs:
     """What a network says about T steps of B robots."""
@@ -70,8 +89,16 @@ class Outputs:
     carry: FLOATS
 
 
-def forward(algo: str, params: Tree, ranges: FLOATS, goal: FLOATS, carry: FLOATS) -> Outputs:
-    """Run one of the three networks over ranges [T, B, R] and goal [T, B, G]."""
+def forward(
+    algo: str,
+    params: Tree,
+    ranges: FLOATS,
+    goal: FLOATS,
+    carry: FLOATS,
+    motion: FLOATS | None = None,
+) -> Outputs:
+    """Run one of the three networks over ranges [T, B, R], goal [T, B, G] and, for one that takes
+    it, motion [T, B, A + 1]."""
     tree = params["params"]
     length, batch = ranges.shape[:2]
     carry = np.array(carry, np.float64)
@@ -82,6 +109,7 @@ def forward(algo: str, params: Tree, ranges: FLOATS, goal: FLOATS, carry: FLOATS
                 [
                     mlp(tree["features"]["ranges"], ranges[t, b]),
                     mlp(tree["features"]["goal"], goal[t, b]),
+                    np.zeros(0) if motion is None else motion[t, b],
                 ]
             )
             if algo == "dqn":

@@ -28,10 +28,15 @@ class Seen:
     goal: Any
 
 
-def small_network(
-    algo: str, *, layer_norm: bool = False, num_skills: int = 2, hidden_size: int = HIDDEN
-) -> QNetwork:
-    config = NetworkConfig(hidden_size=hidden_size, num_skills=num_skills, layer_norm=layer_norm)
+@struct.dataclass
+class SeenWithMotion(Seen):
+    """One for networks that take their last motion, too."""
+
+    motion: Any
+
+
+def small_network(algo: str, *, hidden_size: int = HIDDEN, **settings: Any) -> QNetwork:
+    config = NetworkConfig(hidden_size=hidden_size, **settings)
     return make_network(algo, config, NUM_ACTIONS)
 
 

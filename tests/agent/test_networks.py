@@ -13,6 +13,7 @@ from small_problems import (
     HIDDEN,
     NUM_ACTIONS,
     Seen,
+    SeenWithMotion,
     in_float64,
     random_obs,
     random_params,
@@ -63,6 +64,26 @@ def test_outputs_are_those_of_the_equations(algo: str, num_skills: int, layer_no
     np.testing.assert_allclose(output.skill_q_values, expected.skill_q_values, atol=1e-5)
     np.testing.assert_allclose(output.q_values, expected.q_values, atol=1e-5)
     np.testing.assert_allclose(new_carry, expected.carry, atol=1e-5)
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_motion_goes_into_the_perception_as_it_is(algo: str) -> None:
+    rng = np.random.default_rng(16)
+    network = small_network(algo, motion_inputs=True)
+    seen = random_obs(rng, LENGTH, BATCH)
+    motion = jnp.asarray(rng.random((LENGTH, BATCH, NUM_ACTIONS + 1)), jnp.float32)
+    obs, carry = SeenWithMotion(seen.ranges, seen.goal, motion), random_carry(rng)
+    params = random_params(network, rng, obs)
+    output = jax.jit(network.apply)(params, obs, carry)[1]
+    expected = forward(
+        algo,
+        in_float64(params),
+        in_float64(obs.ranges),
+        in_float64(obs.goal),
+        carry,
+        in_float64(motion),
+    )
+    np.testing.assert_allclose(output.q_values, expected.q_values, atol=1e-5)
 
 
 def plain_mlp(block: Any, inputs: jax.Array) -> jax.Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from small_problems import HIDDEN, Seen, random_episodes
+from small_problems import HIDDEN, Seen, SeenWithMotion, random_episodes
 
 from sqn_jax.agent import Trajectory, r2d2, replay
 
@@ -207,6 +207,18 @@ def test_packed_episodes_come_back_to_the_rounding_of_their_integers() -> None:
     np.testing.assert_array_equal(back.obs.goal[0, 0], [0.0, 1.0])
     for name in ("actions", "rewards", "terminated"):
         np.testing.assert_array_equal(getattr(back, name), getattr(episodes, name))
+
+
+def test_packed_motion_comes_back_exactly() -> None:
+    rng = np.random.default_rng(42)
+    episodes = random_episodes(rng, 5, 3)
+    motion = jnp.asarray(rng.integers(0, 2, (6, 3, 4)), jnp.float32)
+    seen = SeenWithMotion(episodes.obs.ranges, episodes.obs.goal, motion)
+    packed = r2d2.pack(episodes.replace(obs=seen))
+    assert packed.obs.motion.dtype == jnp.uint8
+    back = r2d2.unpack(packed, HIDDEN).obs.motion
+    assert back.dtype == jnp.float32
+    np.testing.assert_array_equal(back, motion)
 
 
 def test_episodes_survive_the_replay_in_order() -> None:

@@ -354,6 +354,25 @@ def test_bug_reads_both_encodings_of_the_goal() -> None:
     assert len(np.unique(chosen[0])) > 2
 
 
+def test_bug_reads_a_rational_goal_distance() -> None:
+    """At d / (d + 5 m) it does what it does at d / 24 m, and knows how far off 60 m are."""
+    rng = np.random.default_rng(1)
+    ranges = jnp.asarray(rng.uniform(0.1, 1.0, (50, 71)), jnp.float32)
+    distance, heading = rng.uniform(1.0, 22.0, 50), rng.uniform(0, 1, 50)
+    chosen = []
+    for encoding, encoded in (
+        ("clipped", distance / 24),
+        ("rational", distance / (distance + 5)),
+    ):
+        bug = Bug(EnvConfig(goal_distance_encoding=encoding))
+        start, act = bug.start(1, jnp.float32(0.3)), jax.jit(jax.vmap(bug.act, in_axes=(None, 0)))
+        goals = jnp.asarray(np.stack([encoded, heading], axis=-1), jnp.float32)
+        chosen.append(act(start, Observation(ranges, goals))[1])
+    np.testing.assert_array_equal(*chosen)
+    far = Observation(ranges[:1], jnp.array([[60 / 65, 0.5]], jnp.float32))
+    assert np.hypot(*act(start, far)[0].goal[0]) == pytest.approx(60.0, abs=1e-3)
+
+
 def test_bug_leaves_no_gap_between_beams_unseen() -> None:
     config = EnvConfig()
     bug = Bug(config)

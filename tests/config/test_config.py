@@ -29,6 +29,7 @@ AT_LEAST_ONE = {
 POSITIVE = {
     *("env.max_range", "env.time_step", "env.goal_radius", "env.max_goal_distance"),
     *("env.coverage_cell", "env.field_of_view_deg", "learner.learning_rate"),
+    "env.goal_distance_scale",
     *("learner.adam_epsilon", "learner.max_grad_norm", "learner.target_update_rate"),
     *("exploration.decay_fraction", "checkpoint_minutes"),
 }
@@ -144,6 +145,8 @@ def test_a_whole_number_passes_for_a_float(name: str) -> None:
         ("env.ray_sectors", 2),
         ("env.ray_sectors", 34),
         ("env.heading_encoding", "degrees"),
+        ("env.goal_distance_encoding", "logarithmic"),
+        ("network.cell", "lstm"),
         ("env.velocity_noise_unit", "percent"),
         ("learner.learning_rate_schedule", "cosine"),
         ("algo", "ppo"),
@@ -243,11 +246,12 @@ def changed_everywhere() -> TrainConfig:
             ray_sectors=24,
             ray_iterations=3,
             heading_encoding="sincos",
+            goal_distance_encoding="rational",
             velocity_noise_unit="absolute",
             range_noise_unit="absolute",
         ),
         randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3, True),
-        network=config_module.NetworkConfig(9, 3, True, 2),
+        network=config_module.NetworkConfig(9, 3, True, 2, True, "refined_gru"),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(
             10,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 import jax
@@ -12,7 +13,8 @@ from grid_oracle import open_map, wrap_map
 from rollouts import Rollout
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import EnvParams, make_env, reset_to, step
+from sqn_jax.env import EnvParams, EnvState, make_env, observe, reset_to, step
+from sqn_jax.env.geometry import decode_goal, encode_distance
 
 SAMPLES = 4000
 Unit = Literal["relative", "absolute"]
@@ -79,6 +81,33 @@ def test_the_goal_distance_saturates_at_its_limit() -> None:
         pose, goal = jnp.array([2.0, 2.0, 0.0]), jnp.array([2.0 + distance, 2.0])
         obs, _ = start_at(jax.random.key(0), pose, goal, params)
         assert obs.goal[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_rational_goal_distance_is_a_half_at_its_scale_and_tells_all_apart(
+    empty_params: EnvParams,
+) -> None:
+    """5, 15 and 60 m at a scale of 5 m: 5/10, 15/20, 60/65; on the agent's input as it stands."""
+    config = EnvConfig(goal_distance_encoding="rational")
+    params = dataclasses.replace(empty_params, config=config)
+    ranges = jnp.full(71, 1.0)
+    for distance, expected in ((0.0, 0.0), (5.0, 0.5), (15.0, 0.75), (60.0, 12 / 13)):
+        state = EnvState(jnp.zeros(3), jnp.array([0.0, distance]), jnp.zeros(1), jnp.int32(0))
+        obs = observe(jax.random.key(0), ranges, state, params)
+        np.testing.assert_allclose(obs.goal, [expected, 0.75 if distance else 0.5], atol=1e-6)
+    distances = jnp.linspace(0.0, 1000.0, 10_001)
+    shown = np.asarray(encode_distance(distances, config))
+    assert (np.diff(shown) > 0).all()
+    assert shown[-1] < 1
+
+
+def test_a_rational_goal_distance_of_60_m_passes_the_replay_to_the_centimeter() -> None:
+    """Half of 1/65535 at a slope of 5 / 65^2 a meter is 6.4 mm."""
+    config = EnvConfig(goal_distance_encoding="rational")
+    distances = np.linspace(0.0, 60.0, 5000)
+    stored = np.round(distances / (distances + 5) * 65535).astype(np.uint16)
+    shown = stored.astype(np.float32) / np.float32(65535)
+    found, _ = decode_goal(np.stack([shown, shown], axis=-1), config)
+    assert np.abs(found - distances).max() < 0.0065
 
 
 def test_the_linear_heading_has_its_seam_behind_the_robot(empty_params: EnvParams) -> None:

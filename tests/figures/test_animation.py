@@ -80,7 +80,7 @@ def film_episode(*, arrival: int = 0, skills: int = 2, **changes: Any) -> Episod
 
 
 def drawn(episode: Episode, index: int) -> NDArray[np.uint8]:
-    return Screen(episode, 800, 580).draw(index)
+    return Screen(episode, 800, 580).draw(index)[..., :3]
 
 
 def places_of(frame: NDArray[np.uint8], colour: Sequence[int], *, map_only: bool = True) -> Any:
@@ -154,13 +154,13 @@ def test_what_does_not_change_takes_hardly_any_room_in_a_gif() -> None:
 
 def test_rare_colours_that_mean_something_keep_their_place_in_a_palette() -> None:
     """Against a picture of nothing but noise, which fills any palette."""
-    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 4), np.uint8)
     palette = animation._Palette([noise])
     for colour in (ROBOT, SEEN, WALL, STAR, BLUE, VERMILLION, GREEN, RED, (255, 255, 255)):
-        (index,) = palette.indices(np.array([[colour]], np.uint8))[0]
+        (index,) = palette.indices(np.array([[(*colour, 255)]], np.uint8))[0]
         assert tuple(palette.table[index]) == colour
     nearest = palette.indices(noise)
-    apart = np.abs(noise[:, :, None].astype(int) - palette.table[None, None, :255]).sum(axis=-1)
+    apart = np.abs(noise[:, :, None, :3].astype(int) - palette.table[None, None, :255]).sum(axis=-1)
     chosen = np.take_along_axis(apart, nearest[..., None].astype(int), axis=2)[..., 0]
     assert (chosen <= 2 * apart.min(axis=-1)).all()
     assert nearest.max() < 255
@@ -329,14 +329,14 @@ def test_the_reward_lines_are_the_sums_up_to_now() -> None:
 def test_the_last_frame_says_that_the_goal_was_reached_and_the_first_does_not() -> None:
     episode = film_episode(arrival=20)
     screen = Screen(episode, 800, 580)
-    first, last = screen.draw(0), screen.draw(40)
+    first, last = screen.draw(0)[..., :3], screen.draw(40)[..., :3]
     words = [text.get_text() for text in screen.figure.texts]
     # At (3, 2) m, 1.4 m from the goal at (4, 1) m.
     assert "step 40 of 60   4.0 s   1.4 m to the goal   reached at step 20" in words
     assert "tester, room" in words
     assert (last[:40] == GREEN).all(axis=-1).any()
     assert not (first[:40] == GREEN).all(axis=-1).any()
-    assert tuple(screen.draw(0)[22, 700]) == tuple(first[22, 700])
+    assert tuple(screen.draw(0)[22, 700, :3]) == tuple(first[22, 700])
 
 
 def test_the_last_frame_of_a_failure_says_so() -> None:
@@ -350,7 +350,7 @@ def test_a_frame_does_not_depend_on_the_frames_before_it() -> None:
     once = screen.draw(30)
     screen.draw(60)
     np.testing.assert_array_equal(screen.draw(30), once)
-    np.testing.assert_array_equal(drawn(film_episode(), 30), once)
+    np.testing.assert_array_equal(drawn(film_episode(), 30), once[..., :3])
 
 
 @pytest.mark.parametrize("arrival", [0, 55])

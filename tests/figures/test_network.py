@@ -22,6 +22,7 @@ NETWORKS = {
     "four skills, layer norm": replace(QUICK, network=replace(QUICK.network, num_skills=4)),
     "R2D2": replace(QUICK, algo="r2d2"),
     "DQN": replace(QUICK, algo="dqn"),
+    "last motion": replace(QUICK, network=replace(QUICK.network, motion_inputs=True)),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,8 +15,14 @@ from sqn_jax.agent import initial_carry, make_network
 from sqn_jax.agent.networks import QOutput
 from sqn_jax.config import NetworkConfig, TrainConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
-from sqn_jax.policies.interventions import fix_skill_weights, single_head, swap_skills
+from sqn_jax.policies.interventions import (
+    fix_skill_weights,
+    single_head,
+    swap_skills,
+    with_motion_inputs,
+)
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.motion import MotionObservation
 from sqn_jax.training.state import params_shapes
 
 CONFIG = TrainConfig(network=NetworkConfig(hidden_size=8, num_skills=3))
@@ -100,3 +107,23 @@ def test_orders_and_agents_that_do_not_fit_are_refused(policy: Policy) -> None:
     single = dataclasses.replace(policy, config=dataclasses.replace(CONFIG, algo="r2d2"))
     with pytest.raises(ValueError, match="is of r2d2, expected an sqn"):
         fix_skill_weights(single, (1,))
+
+
+@pytest.mark.parametrize("algo", ["sqn", "r2d2", "dqn"])
+def test_with_motion_inputs_the_q_values_are_what_they_were(algo: Any) -> None:
+    """Whatever the motion: its weights are zero, and all others are where they were."""
+    config = dataclasses.replace(CONFIG, algo=algo)
+    network = make_network(algo, config.network, NUM_ACTIONS)
+    before = Policy("made up", config, (random_params(network, small_room(9)),))
+    after = with_motion_inputs(before)
+    wider = make_network(algo, after.config.network, NUM_ACTIONS)
+    assert jax.tree.map(np.shape, after.params[0]) == jax.tree.map(
+        lambda x: x.shape, params_shapes(after.config)
+    )
+    rng, carry = np.random.default_rng(8), initial_carry(CONFIG.network, 2)
+    seen = (rng.random((6, 2, size), np.float32) for size in (71, 2, NUM_ACTIONS + 1))
+    obs = MotionObservation(*seen)
+    expected = network.apply(before.params[0], Observation(obs.ranges, obs.goal), carry)
+    found = wider.apply(after.params[0], obs, carry)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5), found, expected)
+    assert with_motion_inputs(after) is after

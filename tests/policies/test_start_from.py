@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 from tiny_runs import TinyRuns
 
-from sqn_jax.policies.run_policies import load_policy
+from sqn_jax.policies.run_policies import load_policy, require_same_network
+from sqn_jax.runs.train import _starting_policy
+from sqn_jax.training.state import params_shapes
 
 same = partial(np.testing.assert_allclose, rtol=0, atol=1e-20)
 
@@ -62,6 +65,7 @@ def test_it_learns_on_from_there(runs: TinyRuns) -> None:
         ),
         (["--env.num-beams", "31"], "its env.num_beams is 71, here it is 31"),
         (["--env.heading-encoding", "sincos"], "its env.heading_encoding is linear, here"),
+        (["--env.goal-distance-encoding", "rational"], "its env.goal_distance_encoding is clipped"),
     ],
 )
 def test_another_network_is_refused_before_anything_is_written(
@@ -72,6 +76,22 @@ def test_another_network_is_refused_before_anything_is_written(
     assert told in err
     assert err.count("\n") == 1
     assert not Path(runs.folder / "refused").exists()
+
+
+def test_a_run_with_motion_inputs_starts_from_a_policy_without(runs: TinyRuns) -> None:
+    """But not the other way round."""
+    policy = load_policy(runs.folder / "first")
+    network = dataclasses.replace(policy.config.network, motion_inputs=True)
+    config = dataclasses.replace(
+        policy.config, network=network, start_from=str(runs.folder / "first")
+    )
+    start = _starting_policy(config)
+    assert start is not None
+    assert jax.tree.map(lambda x: x.shape, start.params[0]) == jax.tree.map(
+        lambda x: x.shape, params_shapes(config)
+    )
+    with pytest.raises(ValueError, match=r"its network\.motion_inputs is True, here it is False"):
+        require_same_network(start, policy.config)
 
 
 def test_what_is_no_policy_is_refused(runs: TinyRuns) -> None:
