@@ -57,14 +57,27 @@ summary { cursor: pointer; margin: .6rem 0; }
 """
 
 
-def to_html(content: Content, pictures: Illustrations) -> str:
-    """The page as text; the same content and pictures give the same text."""
+def to_html(
+    content: Content,
+    pictures: Illustrations,
+    play_links: Sequence[str | None] = (),
+    *,
+    no_play: str = "",
+) -> str:
+    """The page as text; the same content and pictures give the same text.
+
+    Args:
+        content: what it is about.
+        pictures: of it.
+        play_links: for each of the worst episodes where one can try it, if anywhere.
+        no_play: why nobody can.
+    """
     title = f"Report on {', '.join(run.name for run in content.runs)}"
     sections = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(lead(content))}</p>',
         f'<p class="note">{escape(_protocol(content.settings, content.agents[0].epsilon))}</p>',
-        *_worst(content.worst, pictures.worst),
+        *_worst(content.worst, pictures.worst, play_links, no_play),
         "<h2>Success and time steps</h2>",
         success_table(content.evaluation["results"], content.settings),
         *_training(content, pictures),
@@ -143,7 +156,12 @@ def _protocol(settings: Settings, epsilon: float) -> str:
     )
 
 
-def _worst(episodes: Sequence[WorstEpisode], pictures: Sequence[Illustration]) -> Iterable[str]:
+def _worst(
+    episodes: Sequence[WorstEpisode],
+    pictures: Sequence[Illustration],
+    play_links: Sequence[str | None],
+    no_play: str,
+) -> Iterable[str]:
     failures = sum(not worst.success for worst in episodes)
     yield "<h2>Worst episodes</h2>"
     if failures == len(episodes):
@@ -153,12 +171,17 @@ def _worst(episodes: Sequence[WorstEpisode], pictures: Sequence[Illustration]) -
     else:
         rule = "No episode failed: the slowest successes relative to their shortest paths."
     yield f'<p class="note">{rule}</p>'
+    if no_play:
+        yield f'<p class="note">There is no page to try them on: {escape(no_play)}.</p>'
+    links = [*play_links, *[None] * (len(episodes) - len(play_links))]
     for number, (worst, picture) in enumerate(zip(episodes, pictures, strict=True), start=1):
         heading = f"{number}. {worst.batch.world.occupancy_map.name}: {_outcome(worst)}"
         yield '<section class="hard">'
         yield f"<h3>{escape(heading)}</h3>"
         yield f"<p>{escape(describe_episode(worst))}</p>"
         yield _figure(picture)
+        if link := links[number - 1]:
+            yield f'<p><a href="{escape(link)}">Try this map yourself</a></p>'
         yield "</section>"
 
 

@@ -174,6 +174,7 @@ def test_the_policy_arrives_behind_a_wall_that_was_drawn(tab: Tab, html: str) ->
 def test_a_drawn_map_is_shared_saved_and_read_by_the_package(tab: Tab, html: str) -> None:
     tab.open(html)
     tab.find("#run").click()
+    tab.find("#restart").click()
     tab.drag((3.0, 1.5), (3.0, 4.5))
     tab.drag((1.0, 3.0), (1.5, 2.0))
     tab.find("#share").click()
