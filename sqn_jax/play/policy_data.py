@@ -15,6 +15,14 @@ from sqn_jax.policies.run_policies import Policy
 PREFIX = "params/"
 """What the paths of all arrays begin with."""
 
+BEYOND: dict[str, tuple[object, ...]] = {
+    "network.motion_inputs": (False, True),
+    "network.cell": ("gru", "refined_gru"),
+    "env.goal_distance_encoding": ("clipped", "rational"),
+    "env.goal_distance_scale": (),
+}
+"""What the page computes beyond what `sqn export` does, see `require_exportable`."""
+
 LARGEST = float(np.finfo(np.float16).max)
 
 
@@ -35,7 +43,7 @@ def policy_data(policy: Policy) -> dict[str, Any]:
         ValueError: the page does not compute such a policy, or a weight is too large for float16.
     """
     config = policy.config
-    require_exportable(config, verb="played")
+    require_exportable(config, verb="played", beyond=BEYOND)
     arrays = flat_arrays(policy.params[0])
     for path, array in arrays.items():
         if (largest := np.abs(array).max()) > LARGEST:

@@ -102,7 +102,8 @@ function play(episode, policyData, mapData) {
   env.reset(episode.pose, episode.goal);
   look(0);
   for (let step = 0; step < episode.actions.length; step += 1) {
-    const { action, qValues, weights } = policy.act(env.observe());
+    const { action: chosen, qValues, weights } = policy.act(env.observe());
+    const action = episode.at_random ? episode.actions[step] : chosen;
     report.qError = Math.max(report.qError, difference(qValues, episode.q_values[step]));
     report.weightError = Math.max(report.weightError, difference(weights, episode.skill_weights[step]));
     if (action !== episode.actions[step]) {

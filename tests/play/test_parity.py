@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,10 @@ from sqn_jax.env.navigation import MOTION_ITERATIONS
 from sqn_jax.maps import OccupancyMap, connected_components, load_map, traversable
 from sqn_jax.maps.atlas import side_by_side
 from sqn_jax.play.map_data import map_data
-from sqn_jax.play.policy_data import policy_data
+from sqn_jax.play.policy_data import BEYOND, policy_data
 from sqn_jax.policies.pretrained import load_pretrained
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.motion import MotionObservation
 from sqn_jax.training.state import network_of, params_shapes
 
 pytestmark = needs_node
@@ -39,8 +41,13 @@ def test_the_parts_agree_with_brute_force() -> None:
 
 def test_episodes_are_those_of_the_program(tmp_path: Path) -> None:
     policies = [load_pretrained(name) for name in ("best", "r2d2", "dqn")]
+    # One that looks at its last action, which is drawn for it and often refused.
+    network = NetworkConfig(hidden_size=16, motion_inputs=True, cell="refined_gru")
+    looking_on = dataclasses.replace(policies[0].config, algo="sqn", network=network)
+    policies.append(random_policy(looking_on))
     maps = [load_map(name) for name in ("maze", "column", "forest")]
-    tasks = [(0, 0, 0), (0, 1, 1), (0, 2, 2), (1, 1, 4), (2, 2, 8)]
+    seeds = [(0, 0, 0), (0, 1, 1), (0, 2, 2), (1, 1, 4), (2, 2, 8), (3, 0, 3)]
+    tasks = [(policy, place, seed, policy == 3) for policy, place, seed in seeds]
     with compiling_quickly():
         question = vectors(policies, maps, tasks, num_steps=400)
     reports = answer("parity.mjs", question, tmp_path)
@@ -58,8 +65,9 @@ def test_episodes_are_those_of_the_program(tmp_path: Path) -> None:
         assert report["edges"] <= 2, report
         assert report["latePoints"] <= 4 * (report["corners"] + report["edges"]), report
     # It is no comparison of robots that stand still.
-    actions = [set(episode["actions"]) for episode in question["episodes"]]
-    assert set.union(*actions) >= {1, 3, 4}
+    *_, last = question["episodes"]
+    assert set(last["actions"]) == {0, 1, 2, 3, 4}
+    assert 2 < sum(last["collisions"]) < 300
     assert any(any(episode["reached"]) for episode in question["episodes"])
 
 
@@ -76,8 +84,12 @@ NETWORKS = {
     "sqn with 3 skills and norms": tiny(num_skills=3, layer_norm=True, heading_encoding="sincos"),
     "sqn with 1 skill": tiny(num_skills=1),
     "r2d2 with norms": tiny("r2d2", layer_norm=True),
+    "sqn with motion": tiny(motion_inputs=True),
+    "r2d2 of refined units": tiny("r2d2", cell="refined_gru", motion_inputs=True),
     "dqn": tiny("dqn", heading_encoding="sincos"),
-    "dqn with norms": tiny("dqn", layer_norm=True, dqn_width_factor=2),
+    "dqn with norms and motion": tiny(
+        "dqn", layer_norm=True, dqn_width_factor=2, motion_inputs=True
+    ),
 }
 STEPS = 12
 
@@ -92,10 +104,12 @@ def random_policy(config: TrainConfig) -> Policy:
 def random_observations(config: TrainConfig) -> Observation:
     rng = np.random.default_rng(1)
     num_goal = 2 if config.env.heading_encoding == "linear" else 3
-    return Observation(
-        ranges=rng.uniform(size=(STEPS, 1, 7)).astype(np.float32),
-        goal=rng.uniform(size=(STEPS, 1, num_goal)).astype(np.float32),
-    )
+    ranges = rng.uniform(size=(STEPS, 1, 7)).astype(np.float32)
+    goal = rng.uniform(size=(STEPS, 1, num_goal)).astype(np.float32)
+    if not config.network.motion_inputs:
+        return Observation(ranges=ranges, goal=goal)
+    motion = rng.integers(2, size=(STEPS, 1, 6)).astype(np.float32)
+    return MotionObservation(ranges=ranges, goal=goal, motion=motion)
 
 
 def as_lists(obs: Observation) -> list[dict[str, list[float]]]:
@@ -245,12 +259,17 @@ def test_moves_of_any_velocity_end_where_the_program_says(tmp_path: Path) -> Non
 def test_what_is_observed_under_noise(tmp_path: Path) -> None:
     place = {"map": map_data(room_map()), "pose": [0.8, 0.8, 0.5], "goal": [2.8, 2.3], "noise": 2}
     draws = [-1.0, -0.5, 0.0, 0.25, 0.5, 0.9, 1.0]
-    changes = [{}, {"range_noise_unit": "absolute", "heading_encoding": "sincos"}]
+    changes: list[dict[str, Any]] = [
+        {},
+        {"range_noise_unit": "absolute", "heading_encoding": "sincos"},
+        {"goal_distance_encoding": "rational", "goal_distance_scale": 10.0},
+        {"max_goal_distance": 2.0},
+    ]
     questions = [
-        {"about": "observation", **place, "draws": draws, "settings": vars(EnvConfig(**ROBOT, **x))}
+        {"about": "observation", **place, "draws": draws, "settings": vars(EnvConfig(**ROBOT | x))}
         for x in changes
     ]
-    relative, absolute = answer("answers.mjs", questions, tmp_path)
+    relative, absolute, rational, far = answer("answers.mjs", questions, tmp_path)
     readings = np.array(relative["readings"])
     for said, noisy in [
         (relative, readings * (1 + 2 * np.array(draws))),
@@ -258,18 +277,25 @@ def test_what_is_observed_under_noise(tmp_path: Path) -> None:
     ]:
         np.testing.assert_allclose(said["ranges"], np.clip(noisy / 3, 0, 1), atol=1e-6)
         assert said["goal"][0] == pytest.approx(0.25)  # 2 and 1.5 m away are 2.5 of 10 m.
+    assert rational["goal"][0] == pytest.approx(2.5 / 12.5)
+    assert far["goal"][0] == 1
     heading = np.arctan2(1.5, 2) - 0.5
     assert relative["goal"][1] == pytest.approx((heading + np.pi) / (2 * np.pi), abs=1e-6)
     expected = [(1 + np.sin(heading)) / 2, (1 + np.cos(heading)) / 2]
     np.testing.assert_allclose(absolute["goal"][1:], expected, atol=1e-6)
 
 
-def test_what_the_page_cannot_compute_is_refused() -> None:
+def test_what_the_page_cannot_compute_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = random_policy(tiny())
     policy.params[0]["params"]["skill_0"]["hidden"]["bias"] = jnp.full(8, 7e4)
     assert refusal(lambda: policy_data(policy)) == (
         "policy tiny: array params/skill_0/hidden/bias has a number of 70000, expected at most "
         "65504"
+    )
+    monkeypatch.delitem(BEYOND, "network.cell")
+    other = random_policy(tiny(cell="refined_gru"))
+    assert refusal(lambda: policy_data(other)) == (
+        "network.cell is 'refined_gru', which cannot be played, expected 'gru'"
     )
     both = side_by_side([room_map(), room_map()], "both")
     assert refusal(lambda: map_data(both)) == "map both: 2 maps side by side, expected one"

@@ -16,6 +16,7 @@ from sqn_jax.play.map_data import map_data
 from sqn_jax.play.policy_data import policy_data
 from sqn_jax.policies.greedy import GreedyPolicy
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.motion import first_observation, next_observation
 
 EXACT = {"ray_iterations": 32}
 """So many hops that no ray is cut short, as the few in a thousand that need more than 8 are."""
@@ -36,7 +37,9 @@ def rounded(policy: Policy) -> Policy:
     return dataclasses.replace(policy, params=halves)
 
 
-def episode(policy: Policy, world: EnvParams, seed: int, num_steps: int) -> dict[str, Any]:
+def episode(
+    policy: Policy, world: EnvParams, seed: int, num_steps: int, *, at_random: bool = False
+) -> dict[str, Any]:
     """What a policy does from one evaluation point to another, step by step, as lists.
 
     Args:
@@ -44,6 +47,7 @@ def episode(policy: Policy, world: EnvParams, seed: int, num_steps: int) -> dict
         world: from `world_of`.
         seed: draws the points and the heading.
         num_steps: T.
+        at_random: actions are drawn, and the policy looks on.
 
     Returns:
         `pose` and `goal` of the task; `poses` and `ranges` after each step and before the first,
@@ -51,35 +55,38 @@ def episode(policy: Policy, world: EnvParams, seed: int, num_steps: int) -> dict
         and time without their weights, and the sum with them), `collisions` and `reached`, T of
         each; `covered`, the points seen in the end.
     """
-    rng = np.random.default_rng(seed)
+    rng, max_range = np.random.default_rng(seed), np.float32(world.config.max_range)
     start, goal = rng.choice(np.asarray(world.spawn_positions)[:, 0], 2, replace=False)
     pose = np.append(start, rng.uniform(-np.pi, np.pi)).astype(np.float32)
     acting = GreedyPolicy(policy.name, policy.config, policy.params[0])
     obs, state = _reset(KEY, pose, goal, world)
-    carry = acting.start()
+    seen, carry = first_observation(obs, policy.config.network), acting.start()
     lists: dict[str, list[Any]] = {name: [] for name in _LISTS}
-    lists["poses"].append(state.pose)
-    lists["ranges"].append(obs.ranges * world.config.max_range)
+    lists["poses"].append(np.asarray(state.pose))
+    lists["ranges"].append(np.asarray(obs.ranges) * max_range)
     for _ in range(num_steps):
-        carry, output = acting.step(obs, carry)
-        action = output.q_values.argmax()
-        obs, state, reward, _, _, info = _step(KEY, state, action, world)
+        carry, output = acting.step(seen, carry)
+        action = rng.integers(5) if at_random else np.asarray(output.q_values).argmax()
+        obs, state, reward, _, _, info = _step(KEY, state, np.int32(action), world)
+        seen = next_observation(seen, obs, action, info["collision"])
         terms = [info[f"reward_{name}"] for name in ("navigation", "exploration", "time")]
         taken = {
             "poses": state.pose,
-            "ranges": obs.ranges * world.config.max_range,
+            "ranges": np.asarray(obs.ranges) * max_range,
             "q_values": output.q_values,
             "skill_weights": output.skill_weights,
             "actions": action,
-            "rewards": [*terms, reward],
+            "rewards": [*map(np.asarray, terms), np.asarray(reward)],
             "collisions": info["collision"],
             "reached": info["reached"],
         }
         for name, value in taken.items():
-            lists[name].append(value)
+            # At once: a list of arrays on the device is copied number by number.
+            lists[name].append(np.asarray(value))
     as_lists = {name: np.array(values).tolist() for name, values in lists.items()}
     points = covered_points(np.asarray(state.covered), world)
-    return {"pose": pose.tolist(), "goal": goal.tolist(), "covered": points, **as_lists}
+    task = {"pose": pose.tolist(), "goal": goal.tolist(), "at_random": at_random}
+    return {**task, "covered": points, **as_lists}
 
 
 _LISTS = (
@@ -111,7 +118,7 @@ def covered_points(covered: NDArray[np.uint32], world: EnvParams) -> list[list[i
 def vectors(
     policies: list[Policy],
     maps: list[OccupancyMap],
-    tasks: list[tuple[int, int, int]],
+    tasks: list[tuple[int, int, int, bool]],
     num_steps: int,
 ) -> dict[str, Any]:
     """Policies and maps as the page has them, and an episode of each task.
@@ -119,14 +126,20 @@ def vectors(
     Args:
         policies: with one training seed.
         maps: of one shape, so that one program serves all.
-        tasks: which policy, which map and a seed.
+        tasks: which policy, which map, a seed, and whether actions are drawn at random.
         num_steps: of an episode.
     """
     halved = [rounded(policy) for policy in policies]
     episodes = [
         {"policy": policy, "map": place}
-        | episode(halved[policy], world_of(maps[place], policies[policy]), seed, num_steps)
-        for policy, place, seed in tasks
+        | episode(
+            halved[policy],
+            world_of(maps[place], policies[policy]),
+            seed,
+            num_steps,
+            at_random=at_random,
+        )
+        for policy, place, seed, at_random in tasks
     ]
     return {
         "policies": [policy_data(policy) for policy in policies],

@@ -119,19 +119,22 @@ export class Grid {
     // The same slack as in Python: 0.15 / 0.05 is not exactly 3.
     const reach = radius / this.resolution - 1e-6;
     const offsets = closeOffsets(reach);
-    const margin = Math.max(0, Math.ceil(reach + 0.5) - 1);
+    const flatOffsets = Int32Array.from(offsets, ([up, right]) => up * width + right);
+    const margin = Math.max(1, Math.ceil(reach + 0.5) - 1);
     for (let cell = 0; cell < occupied.length; cell += 1) {
       if (!occupied[cell]) continue;
       const column = cell % width;
       const row = (cell - column) / width;
-      const inside = column > 0 && row > 0 && column < width - 1 && row < height - 1;
-      const around = occupied[cell - 1] + occupied[cell + 1] + occupied[cell - width] + occupied[cell + width];
-      // Whatever is near to a cell among occupied ones is nearer to one of these.
-      if (inside && around === 4) continue;
-      const whole = column >= margin && row >= margin && column < width - margin && row < height - margin;
+      if (column >= margin && row >= margin && column < width - margin && row < height - margin) {
+        const beside = occupied[cell - 1] + occupied[cell + 1];
+        // Whatever is near to a cell among occupied ones is nearer to one of these.
+        if (beside + occupied[cell - width] + occupied[cell + width] === 4) continue;
+        for (const offset of flatOffsets) blocked[cell + offset] = 1;
+        continue;
+      }
       for (const [up, right] of offsets) {
         const [y, x] = [row + up, column + right];
-        if (whole || (x >= 0 && y >= 0 && x < width && y < height)) blocked[y * width + x] = 1;
+        if (x >= 0 && y >= 0 && x < width && y < height) blocked[y * width + x] = 1;
       }
     }
     return blocked;

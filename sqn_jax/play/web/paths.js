@@ -24,8 +24,14 @@ export function shortestPath(grid, blocked, from, to) {
   const [goalX, goalY] = to.map((meters) => meters / grid.resolution);
   const straight = (cell) => {
     const column = cell % width;
-    return Math.hypot(column + 0.5 - goalX, (cell - column) / width + 0.5 - goalY);
+    const [dx, dy] = [column + 0.5 - goalX, (cell - column) / width + 0.5 - goalY];
+    // Several times faster than Math.hypot.
+    return Math.sqrt(dx * dx + dy * dy);
   };
+  const moves = PATH_MOVES.map((move) => {
+    const touched = Int32Array.from(move.cells, ([up, right]) => up * width + right);
+    return { ...move, touched };
+  });
   const near = new Map(cellsSeenFrom(grid, blocked, end).map((cell) => [cell, straight(cell)]));
   // Best first, by length so far plus the straight line, which is never longer than what is left.
   const lengths = new Float64Array(blocked.length).fill(Infinity);
@@ -43,12 +49,12 @@ export function shortestPath(grid, blocked, from, to) {
     }
     const column = cell % width;
     const row = (cell - column) / width;
-    for (const move of PATH_MOVES) {
+    for (const move of moves) {
       const [x, y] = [column + move.right, row + move.up];
       if (x < 0 || y < 0 || x >= width || y >= grid.height) continue;
       const next = y * width + x;
       const length = lengths[cell] + move.length;
-      if (length >= lengths[next] || !isClear(blocked, width, cell, move)) continue;
+      if (length >= lengths[next] || !isClear(blocked, cell, move.touched)) continue;
       lengths[next] = length;
       before[next] = cell;
       queue.push(length + straight(next), next);
@@ -90,9 +96,9 @@ function lineCells(up, right) {
 }
 
 /** Whether a move from a free cell, which ends on the grid, touches free cells only. */
-function isClear(blocked, width, cell, move) {
-  for (const [up, right] of move.cells) {
-    if (blocked[cell + up * width + right]) return false;
+function isClear(blocked, cell, touched) {
+  for (const offset of touched) {
+    if (blocked[cell + offset]) return false;
   }
   return true;
 }
