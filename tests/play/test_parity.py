@@ -52,12 +52,13 @@ def test_episodes_are_those_of_the_program(tmp_path: Path) -> None:
         question = vectors(policies, maps, tasks, num_steps=400)
     reports = answer("parity.mjs", question, tmp_path)
     assert [report["map"] for report in reports[:3]] == ["maze", "column", "forest"]
-    for report in reports:
+    for report, episode in zip(reports, question["episodes"], strict=True):
         assert report["wrongActions"] == report["wrongFlags"] == [], report
         assert report["wrongRanges"] == report["wrongPoints"] == 0, report
         assert report["poseError"] < 1e-4
         assert report["rangeError"] < 1e-4
-        assert report["qError"] < 1e-3
+        # Random weights give values of hundreds.
+        assert report["qError"] < max(1e-3, 1e-5 * np.abs(episode["q_values"]).max())
         assert report["weightError"] < 1e-4
         assert report["rewardError"] < 1e-5
         # Of 28,400 readings those along a corner, and points on the very edge of a sector.
@@ -161,7 +162,8 @@ def random_room(rows: int, columns: int, resolution: float, seed: int) -> Occupa
 
 
 def test_blocked_cells_parts_and_paths_are_those_of_the_program(tmp_path: Path) -> None:
-    cases = [(0.0, 0.1, 0), (0.1, 0.05, 1), (0.15, 0.05, 2), (0.1, 0.1, 3), (0.07, 0.1, 4)]
+    # 0.035 / 0.01 comes out a little above 3.5.
+    cases = [(0.0, 0.1, 0), (0.1, 0.05, 1), (0.15, 0.05, 2), (0.07, 0.1, 3), (0.035, 0.01, 4)]
     questions, expected = [], []
     for radius, resolution, seed in cases:
         room = random_room(50, 61, resolution, seed)
@@ -224,6 +226,10 @@ def test_moves_of_any_velocity_end_where_the_program_says(tmp_path: Path) -> Non
     velocities = rng.normal(size=(400, 2)) * [4, 4]
     velocities[::7, 0] = 0  # Turns on the spot, and straight moves.
     velocities[1::7, 1] = 0
+    # A step ends half a millimeter before the border at 3.8 m, or is refused.
+    gaps = np.array([-1e-3, 1e-4, 4e-4, 6e-4, 1e-3])
+    poses[:5] = np.column_stack([3.8 - 0.25 - gaps, np.full(5, 0.75), np.zeros(5)])
+    velocities[:5] = [2.5, 0]
     velocities = velocities.astype(np.float32)
 
     @jax.jit
@@ -251,6 +257,7 @@ def test_moves_of_any_velocity_end_where_the_program_says(tmp_path: Path) -> Non
     (said,) = answer("answers.mjs", [question], tmp_path)
     assert [step["collision"] for step in said] == np.asarray(refused).tolist()
     np.testing.assert_allclose([step["pose"] for step in said], np.asarray(ends), atol=2e-6)
+    assert refused[:5].tolist() == [True, True, True, False, False]
     assert 40 < refused.sum() < 360
     # Standing still is no move that a robot could notice to be refused.
     assert {tuple(step["motion"]) for step in said} == {(1, 0, 0, 0, 0, 0)}

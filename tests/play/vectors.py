@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.play.map_data import map_data
@@ -18,16 +20,17 @@ from sqn_jax.policies.greedy import GreedyPolicy
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.training.motion import first_observation, next_observation
 
-EXACT = {"ray_iterations": 32}
+EXACT: dict[str, Any] = {"ray_iterations": 32}
 """So many hops that no ray is cut short, as the few in a thousand that need more than 8 are."""
 
 KEY = jax.random.key(0)
 """Nothing is drawn with it: there is no noise."""
 
 
-def world_of(occupancy_map: OccupancyMap, policy: Policy) -> EnvParams:
-    """The world of a policy, tasks at the map's evaluation points."""
-    config = dataclasses.replace(policy.config.env, near_goal_fraction=0.0, **EXACT)
+@cache
+def world_of(occupancy_map: OccupancyMap, config: EnvConfig) -> EnvParams:
+    """The world of a policy's settings, tasks at the map's evaluation points."""
+    config = dataclasses.replace(config, near_goal_fraction=0.0, **EXACT)
     return make_env(occupancy_map, config, spawn="evaluation")
 
 
@@ -134,7 +137,7 @@ def vectors(
         {"policy": policy, "map": place}
         | episode(
             halved[policy],
-            world_of(maps[place], policies[policy]),
+            world_of(maps[place], policies[policy].config.env),
             seed,
             num_steps,
             at_random=at_random,
