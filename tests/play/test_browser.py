@@ -221,13 +221,14 @@ def test_an_image_becomes_a_map(tab: Tab, html: str) -> None:
 
 
 def test_a_person_drives_with_the_keys_and_the_policy_keeps_pace(tab: Tab, html: str) -> None:
+    from selenium.webdriver.common.keys import Keys
+
     tab.open(html)
     tab.find("#drivers label:last-of-type").click()
-    tab.run("document.activeElement.blur()")
     steps = [tab.text(f"#score-{who} td") for who in ("you", "policy")]
     assert steps == ["0", "0"]
-    for count in range(1, 4):
-        tab.press("w")
+    for count, key in enumerate(("w", Keys.ARROW_UP, "a"), start=1):
+        tab.press(key)
         tab.until(lambda n=count: tab.text("#score-you td") == str(n), "a step")
     assert tab.text("#score-policy td") == "3"
     tab.find("#pad button").click()

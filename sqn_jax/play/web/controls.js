@@ -26,17 +26,20 @@ const CROSS_KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], Ar
 export function listenToPointer(canvas, toMap, handlers) {
   let thing = null;
   let last = null;
+  let pointer = null;
   let erases = false;
   canvas.addEventListener('contextmenu', (event) => event.preventDefault());
   canvas.addEventListener('pointerdown', (event) => {
     if (last || event.button > 2) return;
-    canvas.setPointerCapture(event.pointerId);
+    pointer = event.pointerId;
+    canvas.setPointerCapture(pointer);
     last = toMap(event);
     erases = event.button === 2;
     thing = erases ? null : handlers.thingAt(last);
     if (!thing) handlers.stroke(last, last, erases);
   });
   canvas.addEventListener('pointermove', (event) => {
+    if (last && event.pointerId !== pointer) return; // A second finger.
     const place = toMap(event);
     if (last && thing) handlers.move(thing, place);
     else if (last) handlers.stroke(last, place, erases);
@@ -44,7 +47,8 @@ export function listenToPointer(canvas, toMap, handlers) {
     handlers.hover(event.pointerType === 'mouse' ? place : null);
     canvas.style.cursor = thing || handlers.thingAt(place) ? 'grab' : 'crosshair';
   });
-  const end = () => {
+  const end = (event) => {
+    if (event.pointerId !== pointer) return;
     if (last) handlers.finish();
     last = thing = null;
   };
@@ -123,7 +127,8 @@ export function listenToKeys(manual, isManual, commands) {
     const action = ACTION_KEYS[event.code];
     const name = (event.ctrlKey ? 'ctrl+' : '') + event.key.toLowerCase();
     // Arrows choose among radio buttons, and Space presses what has the focus.
-    const isTaken = isControl && (event.key === ' ' || event.key === 'Enter' || target.type === 'radio');
+    const isArrow = target.type === 'radio' && event.key.startsWith('Arrow');
+    const isTaken = isControl && (event.key === ' ' || event.key === 'Enter' || isArrow);
     if (isManual() && action !== undefined && !event.ctrlKey && !isTaken) {
       if (!event.repeat) manual.press(action);
     } else if (commands[name] && !isTaken) {

@@ -76,54 +76,46 @@ export class Episode {
 }
 
 /**
- * The cells in which a task can lie: one connected part of the free ground, the largest or that of a place.
- * @param {Grid} grid
- * @param {Uint8Array} blocked from `grid.blockedFor(radius)`
- * @param {number[] | null} place x m, y m
- * @returns {number[]} cells
- */
-function connectedCells(grid, blocked, place) {
-  const { labels, sizes } = grid.components(blocked);
-  let label = place ? labels[grid.cellAt(...place)] : 0;
-  if (!label) label = sizes.indexOf(Math.max(...sizes.slice(1)));
-  const cells = [];
-  if (label > 0) labels.forEach((found, cell) => found === label && cells.push(cell));
-  return cells;
-}
-
-/**
  * A task at random: between two of the given points, or two free places, with a way between them.
  * @param {Grid} grid
- * @param {number} radius m of the robot
+ * @param {Uint8Array} blocked from `grid.blockedFor(radius)`
  * @param {number[][]} points x m, y m each, from which to choose if two of them can be used
  * @param {Random} random
  * @returns {Task | null} null where there is no room
  */
-export function randomTask(grid, radius, points, random) {
-  const blocked = grid.blockedFor(radius);
-  const cells = connectedCells(grid, blocked, points[0] ?? null);
-  if (cells.length < FEWEST_FREE_CELLS) return null;
-  const inside = new Set(cells);
-  const usable = points.filter((point) => inside.has(grid.cellAt(...point)));
-  const places = usable.length > 1 ? usable : cells;
-  const start = random.integer(places.length);
-  const goal = (start + 1 + random.integer(places.length - 1)) % places.length;
+export function randomTask(grid, blocked, points, random) {
+  const { labels, sizes } = grid.components(blocked);
+  // The part of the first point, or else the largest.
+  let label = points.length ? labels[grid.cellAt(...points[0])] : 0;
+  if (!label) label = sizes.indexOf(Math.max(0, ...sizes.slice(1)));
+  if (label < 1 || sizes[label] < FEWEST_FREE_CELLS) return null;
+  const usable = points.filter((point) => labels[grid.cellAt(...point)] === label);
+  const count = usable.length > 1 ? usable.length : sizes[label];
+  const start = random.integer(count);
+  const goal = (start + 1 + random.integer(count - 1)) % count;
   const [from, to] = [start, goal].map((index) =>
-    usable.length > 1 ? places[index] : grid.centerOf(places[index]),
+    usable.length > 1 ? usable[index] : grid.centerOf(cellOfPart(labels, label, index)),
   );
-  return { start: [...from.slice(0, 2), random.between(-Math.PI, Math.PI)], goal: [...to.slice(0, 2)] };
+  return { start: [...from, random.between(-Math.PI, Math.PI)], goal: [...to] };
+}
+
+/** The cell that comes `index` cells after the first of a part. */
+function cellOfPart(labels, label, index) {
+  let cell = labels.indexOf(label);
+  for (let left = index; left > 0; left -= 1) cell = labels.indexOf(label, cell + 1);
+  return cell;
 }
 
 /**
  * The shortest path of a task.
  * @param {Grid} grid
+ * @param {Uint8Array} blocked from `grid.blockedFor(radius)`
  * @param {Task} task
  * @param {EnvSettings} settings
  * @returns {{length: number, points: number[][], steps: number} | null} m, corners, and the steps that it
  *   takes at full speed; null where there is none
  */
-export function pathOf(grid, task, settings) {
-  const blocked = grid.blockedFor(settings.robot_radius);
+export function pathOf(grid, blocked, task, settings) {
   const path = shortestPath(grid, blocked, task.start.slice(0, 2), task.goal);
   const perStep = settings.forward_speed * settings.time_step;
   return path && { ...path, steps: Math.max(1, Math.ceil(path.length / perStep)) };

@@ -2,7 +2,6 @@ import { MAP_KINDS } from './generate.js';
 import { QBars, byId, drawHidden, drawRewards, drawSkills, fillRow, skillKey } from './panels.js';
 import { Manual, listenToCross, listenToKeys, listenToPad, listenToPointer } from './controls.js';
 import { fileName, fromHash, fromImage, readImage, toHash, toPng, toYaml } from './share.js';
-import { pathOf } from './episode.js';
 import { View } from './view.js';
 import { World } from './world.js';
 
@@ -72,6 +71,13 @@ class Page {
     this.refresh();
   }
 
+  /** Run, unless the user would rather see no motion that was not asked for. */
+  begin() {
+    const isCalm = matchMedia('(prefers-reduced-motion: reduce)').matches;
+    this.setRunning(!isCalm);
+    if (isCalm) this.say('Press Run: the policy drives to the star.');
+  }
+
   stepOnce() {
     if (this.world.isManual || this.world.isOver) return;
     this.setRunning(false);
@@ -81,7 +87,10 @@ class Page {
 
   setManual(isManual) {
     byId('pad').hidden = !isManual;
-    if (isManual) this.setSpeed(0);
+    if (isManual) {
+      this.setSpeed(0);
+      byId('map').focus(); // Else the arrow keys would choose who drives.
+    }
     this.world.setManual(isManual);
     this.setRunning(true);
     if (isManual) this.say('Arrow keys or W A S D drive. The policy takes a step whenever you do.');
@@ -97,7 +106,7 @@ class Page {
     requestAnimationFrame((next) => this.frame(next));
     const seconds = Math.min(0.1, (now - this.lastFrame) / 1000);
     this.lastFrame = now;
-    if (this.world.wallsHaveChanged) this.world.applyWalls();
+    this.world.applyWalls();
     if (this.isRunning) this.advance(seconds);
     if (!this.needsDrawing) return;
     this.needsDrawing = false;
@@ -207,13 +216,13 @@ class Page {
     if (!shared) return;
     if (shared.mapName !== null) this.world.useMap(names.indexOf(shared.mapName), shared.task);
     else this.world.useOther(shared.grid, 'shared map', shared.task);
-    this.setRunning(true);
+    this.begin();
   }
 
   async save() {
     const { grid, task, maxSteps } = this.world;
     const png = await toPng(grid);
-    const isSolvable = pathOf(grid, task, this.settings) !== null;
+    const isSolvable = this.world.shortestPath() !== null;
     for (const url of this.savedUrls ?? []) URL.revokeObjectURL(url);
     const name = fileName(byId('save-name').value);
     const yaml = toYaml(name, grid, maxSteps, isSolvable ? task : null);
@@ -390,10 +399,7 @@ function start() {
   const data = JSON.parse(byId('data').textContent);
   byId('beams').textContent = data.policy.env.num_beams;
   byId('policy-name').textContent = `Policy: ${data.policy.name} (${data.policy.algo.toUpperCase()})`;
-  const page = new Page(data);
-  const isCalm = matchMedia('(prefers-reduced-motion: reduce)').matches;
-  page.setRunning(!isCalm);
-  if (isCalm) page.say('Press Run: the policy drives to the star.');
+  new Page(data).begin();
 }
 
 start();

@@ -44,9 +44,8 @@ export class World {
    * @param {Task | null} task one at random if null
    */
   useMap(index, task = null) {
-    const map = this.data.maps[index];
-    this.label = this.mapName = map.name;
-    this.setGrid(unpackMap(map), task, map.spawn_points, map.max_steps);
+    const { name, spawn_points: points, max_steps: steps } = this.data.maps[index];
+    this.setGrid(unpackMap(this.data.maps[index]), task, { label: name, mapName: name, points, steps });
   }
 
   /**
@@ -54,12 +53,12 @@ export class World {
    * @param {Grid} grid
    * @param {string} label
    * @param {Task | null} task one at random if null, or if no robot can stand there
+   * @throws {RangeError} no robot can stand anywhere
    */
   useOther(grid, label, task = null) {
-    this.label = label;
-    this.mapName = null;
     const size = Math.max(grid.width, grid.height) * grid.resolution;
-    this.setGrid(grid, task, [], USUAL_STEPS[Number(size > LARGE)]);
+    const steps = USUAL_STEPS[Number(size > LARGE)];
+    this.setGrid(grid, task, { label, mapName: null, points: [], steps });
   }
 
   /** @param {string} kind one of `MAP_KINDS` */
@@ -69,21 +68,23 @@ export class World {
     this.useOther(grid, `random ${kind}`, { start, goal });
   }
 
-  setGrid(grid, task, points, steps) {
-    const { policy } = this.data;
-    if (!randomTask(grid, this.settings.robot_radius, points, this.random)) {
-      throw new RangeError('No room for the robot on this map.');
-    }
-    this.grid = grid;
-    this.points = points;
+  setGrid(grid, task, { label, mapName, points, steps }) {
+    const blocked = grid.blockedFor(this.settings.robot_radius);
+    const isFree = ([x, y]) => blocked[grid.cellAt(x, y)] === 0;
+    const isUsable = task && isFree(task.start) && isFree(task.goal);
+    const first = isUsable ? task : randomTask(grid, blocked, points, this.random);
+    if (!first) throw new RangeError('No room for the robot on this map.');
+    Object.assign(this, { grid, label, mapName, points });
     this.maxSteps = this.settings.max_steps || steps;
     this.undoable = [];
+    this.stroke = null;
+    this.wallsHaveChanged = false;
+    const { policy } = this.data;
     this.episodes = [0, 1].map(() => new Episode(policy, grid, new Random(this.random.bits())));
     [this.episode, this.manualEpisode] = this.episodes;
     this.events.onGrid(true);
     this.events.onName();
-    if (task && this.canStand(task.start) && this.canStand(task.goal)) this.setTask(task);
-    else this.drawTask();
+    this.setTask(first);
   }
 
   /** @returns {boolean} whether the robot's center may be there */
@@ -93,8 +94,8 @@ export class World {
 
   /** A task at random. */
   drawTask() {
-    const radius = this.settings.robot_radius;
-    const task = randomTask(this.grid, radius, this.points, this.random);
+    this.applyWalls();
+    const task = randomTask(this.grid, this.episode.env.blocked, this.points, this.random);
     if (task) this.setTask(task);
     else this.events.say('No room for the robot on this map.');
   }
@@ -143,9 +144,15 @@ export class World {
 
   searchPath() {
     clearTimeout(this.pathTimer);
-    this.path = pathOf(this.grid, this.task, this.settings);
+    this.path = this.shortestPath();
     if (!this.path) this.events.say(WALLED_OFF);
     this.events.onName();
+  }
+
+  /** @returns {{length: number, points: number[][], steps: number} | null} as `pathOf` has it */
+  shortestPath() {
+    this.applyWalls();
+    return pathOf(this.grid, this.episode.env.blocked, this.task, this.settings);
   }
 
   // Robots on their way.
@@ -216,7 +223,7 @@ export class World {
     const value = erases ? 0 : 1;
     const { occupied } = this.grid;
     const robots = this.isManual ? this.episodes : [this.episode];
-    const keptFree = [...robots.map(({ env }) => env.pose), this.task.goal];
+    const keptFree = [...robots.map(({ env }) => env.pose), this.task.start, this.task.goal];
     const distance = this.settings.robot_radius + 2 * this.grid.resolution;
     const cells = this.grid.strokeCells(from, to, thickness).filter((cell) => {
       if (occupied[cell] === value) return false;
@@ -258,6 +265,7 @@ export class World {
     const last = this.undoable.pop();
     if (!last) return;
     this.grid.setCells(last.cells, 1 - last.value);
+    this.wallsHaveChanged = true;
     this.applyWalls();
     const isStuck = this.episodes.some(({ env }) => !this.canStand(env.pose));
     if (!this.canStand(this.task.goal) || !this.canStand(this.task.start)) this.drawTask();
@@ -266,8 +274,9 @@ export class World {
     this.events.onName();
   }
 
-  /** Let the robots know of walls that have changed; once a frame is enough. */
+  /** Let the robots know of walls, if any have changed; once a frame is enough. */
   applyWalls() {
+    if (!this.wallsHaveChanged) return;
     this.wallsHaveChanged = false;
     for (const { env } of this.episodes) env.gridChanged();
     this.events.onGrid(false);
