@@ -176,6 +176,7 @@ def test_a_drawn_map_is_shared_saved_and_read_by_the_package(tab: Tab, html: str
     tab.find("#run").click()
     tab.find("#restart").click()
     tab.drag((3.0, 1.5), (3.0, 4.5))
+    tab.drag((5.0, 2.0), (5.0, 4.0))  # Through the goal.
     tab.drag((1.0, 3.0), (1.5, 2.0))
     tab.find("#share").click()
     tab.until(lambda: "#" in tab.driver.current_url, "a link")
@@ -195,7 +196,9 @@ def test_a_drawn_map_is_shared_saved_and_read_by_the_package(tab: Tab, html: str
     assert (occupied.shape, loaded.resolution, loaded.max_steps) == ((120, 120), 0.05, 400)
     assert occupied[30:90, 60].all()
     assert not occupied[25:95, :55][:, 1:].any()
-    assert not occupied[25:95, 66:-1].any()
+    assert not occupied[25:95, 66:95].any()
+    assert occupied[42:54, 100].all()
+    assert not occupied[57:63, 95:105].any()
     np.testing.assert_allclose(loaded.evaluation_points, [[1.5, 2.0], [5.0, 3.0]], atol=0.03)
     assert "sqn map check _my_room.yaml" in tab.text("#save-commands")
 
