@@ -1,7 +1,8 @@
 """Draw the pictures of README and docs anew: python experiments/gallery.py [--only NAME ...]
 
 Maps and episodes are driven and drawn, by the policies that come with the package; learning curves
-and noise come from the records in experiments/results/. Everything goes to docs/images/.
+and noise come from the records in experiments/results/. Everything goes to docs/images/, but
+for the page to play on (`--only play`), docs/play.html.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from experiments import play_page
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
 from sqn_jax.config.presets import PAPER_MAPS, PRESETS
@@ -133,7 +135,7 @@ FILMS = {"maze": ("sqn", 8), "cave": ("best", 6)}
 def main() -> None:
     """Draw what is asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", choices=[*STILLS, *FILMS], metavar="NAME")
+    parser.add_argument("--only", nargs="+", choices=[*STILLS, *FILMS, "play"], metavar="NAME")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default docs/images)")
     options = parser.parse_args()
     for name, draw in STILLS.items():
@@ -145,6 +147,14 @@ def main() -> None:
             film = figures.gif(episodes(policy, name, count)[0], count=160, width_px=720)
             (options.out / f"{name}.gif").write_bytes(film)
             print(f"wrote {options.out / name}.gif", flush=True)
+    if not options.only or "play" in options.only:
+        page = options.out.parent / "play.html"
+        play_page.write_page(page)
+        pictures = play_page.take_pictures(page, options.out)
+        for path in (page, *pictures):
+            print(f"wrote {path}", flush=True)
+        if not pictures:
+            print("no pictures of it: they need chromium, chromedriver and sqn_jax[browser]")
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from sqn_jax.config.presets import PRESETS
 from sqn_jax.export import check, folder
 from sqn_jax.figures import style
 from sqn_jax.maps import known_maps
+from sqn_jax.play import page as play_page
 from sqn_jax.policies import pretrained
 from sqn_jax.policies.run_policies import Policy, require_same_network
 from sqn_jax.report import render
@@ -65,6 +66,7 @@ SMALLER = {
     "map": {},
     "tasks": {"--count": ["--count", "1"]},
     "export": {},
+    "play": {},
 }
 
 
@@ -242,7 +244,10 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cli_tasks = importlib.import_module("sqn_jax.cli.tasks")
     for name in ("_convert", "_generate", "_check"):
         monkeypatch.setattr(cli_tasks, name, begin)
-    for module, name in ((folder, "export_policy"), (check, "check_export")):
+    for module, name in (
+        *((folder, "export_policy"), (check, "check_export")),
+        (play_page, "play_page"),
+    ):
         monkeypatch.setattr(module, name, begin)
     for module, function in (
         *((pretrained, find_policy), (train, train_session), (evaluate, evaluate_session)),

@@ -25,6 +25,7 @@ from sqn_jax.cli.evaluate import evaluate
 from sqn_jax.cli.export import export
 from sqn_jax.cli.maps import check_map
 from sqn_jax.cli.pictures import render, report
+from sqn_jax.cli.play import play
 from sqn_jax.cli.tasks import tasks
 from sqn_jax.cli.train import train
 from sqn_jax.outside.messages import say, say_lines
@@ -36,6 +37,7 @@ _SUMMARIES = {
     "evaluate RUN ...": "compare trained robots and baselines on any maps, with noise",
     "report RUN ...": "the same as a page with pictures, the worst episodes first",
     "render RUN ...": "animations and pictures of what trained robots do on a map",
+    "play POLICY": "a page that runs a trained robot in the browser, on maps that you draw",
     "export POLICY": "write a trained robot's policy for its computer: ONNX, or NumPy alone",
     "map check FILE": "describe a map, or say what is wrong with it",
     "tasks ACTION": "make or check a suite of tasks, on public benchmarks or fresh maps",
@@ -133,6 +135,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "evaluate": evaluate,
     "report": report,
     "render": render,
+    "play": play,
     "export": export,
     "map": check_map,
     "tasks": tasks,

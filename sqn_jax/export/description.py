@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from sqn_jax import __version__
@@ -35,28 +37,39 @@ KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
 KNOWN_CHOICES = {"algo": ("sqn", "r2d2", "dqn"), "env.heading_encoding": ("linear", "sincos")}
 
 
-def require_exportable(config: TrainConfig) -> None:
+def require_exportable(
+    config: TrainConfig,
+    *,
+    verb: str = "exported",
+    beyond: Mapping[str, tuple[object, ...]] = MappingProxyType({}),
+) -> None:
     """Refuse by name what the exported files do not compute.
 
+    Args:
+        config: of the policy.
+        verb: what it is wanted for, in the error.
+        beyond: what else is computed there: settings by their names, each with the values it may
+            have, or with none where it may have any.
+
     Raises:
-        ValueError: a setting of the network or of what it sees is unknown here.
+        ValueError: a setting of the network or of what it sees is unknown there.
     """
+    choices = {**KNOWN_CHOICES, **beyond}
     for prefix, group in (("network", config.network), ("env", config.env)):
         known = KNOWN_SETTINGS[type(group)]
         for field in dataclasses.fields(group):
-            value = getattr(group, field.name)
+            name, value = f"{prefix}.{field.name}", getattr(group, field.name)
             default = getattr(type(group)(), field.name)
-            if field.name not in known and value != default:
+            if field.name not in known and name not in choices and value != default:
                 raise ValueError(
-                    f"{prefix}.{field.name} is {value!r}, which cannot be exported, expected "
-                    f"{default!r}"
+                    f"{name} is {value!r}, which cannot be {verb}, expected {default!r}"
                 )
     values = configs.flat(configs.to_dict(config))
-    for name, choices in KNOWN_CHOICES.items():
-        if values[name] not in choices:
+    for name, allowed in choices.items():
+        if allowed and values[name] not in allowed:
             raise ValueError(
-                f"{name} is {values[name]!r}, which cannot be exported, expected one of "
-                f"{', '.join(choices)}"
+                f"{name} is {values[name]!r}, which cannot be {verb}, expected one of "
+                f"{', '.join(map(str, allowed))}"
             )
 
 

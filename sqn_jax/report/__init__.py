@@ -1,7 +1,7 @@
 """A report on trained policies: one page that needs no other files and no network.
 
 `content` runs the evaluation, `episodes` ranks the episodes and finds where robots got stuck,
-`pictures` draws, `page` writes HTML.
+`pictures` draws, `page` writes HTML, `play` the page beside it, to try the worst episode on.
 """
 
 from __future__ import annotations
@@ -10,12 +10,26 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sqn_jax.evaluation.settings import Settings
+from sqn_jax.outside.messages import say
 from sqn_jax.report.content import Run, gather_content, read_runs
-from sqn_jax.report.page import require_writable, to_html, write_page
+from sqn_jax.report.page import to_html
 from sqn_jax.report.pictures import draw_pictures
+from sqn_jax.report.play import path_beside, worst_to_play
+from sqn_jax.storage import html
 from sqn_jax.storage.compile_cache import cached_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
+
+
+def require_writable(out: Path) -> None:
+    """Refuse a report that could not be written, before any episode runs.
+
+    Raises:
+        ValueError: the name does not end in .html, or the file or the one beside it cannot be
+            written.
+    """
+    html.require_writable(out)
+    html.require_writable(path_beside(out))
 
 
 @cached_programs()
@@ -27,12 +41,12 @@ def write_report(
     baselines: bool = True,
     epsilon: float = 0.0,
 ) -> None:
-    """Evaluate runs with a progress bar and write a page about them.
+    """Evaluate runs with a progress bar and write a page about them, and one to play on.
 
     Args:
         runs: from `read_runs`, at least one.
         settings: of the evaluation; the report is for the first goal radius.
-        out: the HTML file; an existing one is replaced.
+        out: the HTML file; an existing one is replaced, as is `path_beside` it.
         baselines: whether to evaluate the oracle and the wall follower too.
         epsilon: probability of a random action of the policies in each step; 0 is greedy.
 
@@ -41,4 +55,13 @@ def write_report(
             cannot be written.
     """
     content = gather_content(runs, settings, baselines=baselines, epsilon=epsilon)
-    write_page(out, to_html(content, draw_pictures(content)))
+    pictures = draw_pictures(content)
+    play_file = path_beside(out)
+    try:
+        playable = worst_to_play(content, play_file.name)
+    except ValueError as error:
+        say(f"{play_file} is left out: {error}")
+        html.write_page(out, to_html(content, pictures, no_play=str(error)))
+        return
+    html.write_page(play_file, playable.html)
+    html.write_page(out, to_html(content, pictures, playable.links))

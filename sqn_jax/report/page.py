@@ -6,7 +6,6 @@ import base64
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from sqn_jax.evaluation.settings import Settings
 from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import NEAR, WorstEpisode
 from sqn_jax.report.pictures import Illustration, Illustrations
-from sqn_jax.storage.files import NotWritten, probe_file, written_whole
 from sqn_jax.storage.run_folder import CONFIG
 
 _BASELINE_NAMES = {"oracle": "oracle (knows the map)", "bug": "bug (wall follower)"}
@@ -59,40 +57,27 @@ summary { cursor: pointer; margin: .6rem 0; }
 """
 
 
-def require_writable(path: Path) -> None:
-    """Refuse a file that could not be written, before any episode runs.
+def to_html(
+    content: Content,
+    pictures: Illustrations,
+    play_links: Sequence[str | None] = (),
+    *,
+    no_play: str = "",
+) -> str:
+    """The page as text; the same content and pictures give the same text.
 
-    Raises:
-        ValueError: the name does not end in .html, or the file cannot be written.
+    Args:
+        content: what it is about.
+        pictures: of it.
+        play_links: for each of the worst episodes where one can try it, if anywhere.
+        no_play: why nobody can.
     """
-    if path.suffix != ".html":
-        raise ValueError(f"--out is {path}, expected a file ending in .html")
-    if not path.parent.is_dir() or path.is_dir():
-        raise ValueError(f"--out {path}: expected a file in an existing folder")
-    try:
-        probe_file(path)
-    except NotWritten as error:
-        raise ValueError(f"--out {error}") from None
-
-
-def write_page(path: Path, html: str) -> None:
-    """Write a page, all or nothing.
-
-    Raises:
-        ValueError: it cannot be written.
-    """
-    with written_whole(path) as partial:
-        partial.write_text(html, encoding="utf-8", errors="replace", newline="\n")
-
-
-def to_html(content: Content, pictures: Illustrations) -> str:
-    """The page as text; the same content and pictures give the same text."""
     title = f"Report on {', '.join(run.name for run in content.runs)}"
     sections = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(lead(content))}</p>',
         f'<p class="note">{escape(_protocol(content.settings, content.agents[0].epsilon))}</p>',
-        *_worst(content.worst, pictures.worst),
+        *_worst(content.worst, pictures.worst, play_links, no_play),
         "<h2>Success and time steps</h2>",
         success_table(content.evaluation["results"], content.settings),
         *_training(content, pictures),
@@ -171,7 +156,12 @@ def _protocol(settings: Settings, epsilon: float) -> str:
     )
 
 
-def _worst(episodes: Sequence[WorstEpisode], pictures: Sequence[Illustration]) -> Iterable[str]:
+def _worst(
+    episodes: Sequence[WorstEpisode],
+    pictures: Sequence[Illustration],
+    play_links: Sequence[str | None],
+    no_play: str,
+) -> Iterable[str]:
     failures = sum(not worst.success for worst in episodes)
     yield "<h2>Worst episodes</h2>"
     if failures == len(episodes):
@@ -181,12 +171,17 @@ def _worst(episodes: Sequence[WorstEpisode], pictures: Sequence[Illustration]) -
     else:
         rule = "No episode failed: the slowest successes relative to their shortest paths."
     yield f'<p class="note">{rule}</p>'
+    if no_play:
+        yield f'<p class="note">There is no page to try them on: {escape(no_play)}.</p>'
+    links = [*play_links, *[None] * (len(episodes) - len(play_links))]
     for number, (worst, picture) in enumerate(zip(episodes, pictures, strict=True), start=1):
         heading = f"{number}. {worst.batch.world.occupancy_map.name}: {_outcome(worst)}"
         yield '<section class="hard">'
         yield f"<h3>{escape(heading)}</h3>"
         yield f"<p>{escape(describe_episode(worst))}</p>"
         yield _figure(picture)
+        if link := links[number - 1]:
+            yield f'<p><a href="{escape(link)}">Try this map yourself</a></p>'
         yield "</section>"
 
 

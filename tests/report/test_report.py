@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ from sqn_jax.report.content import Content, Run, changed_settings
 from sqn_jax.report.episodes import Place, WorstEpisode, densest_place, worst_episodes
 from sqn_jax.report.page import describe_episode, lead, success_table, to_html
 from sqn_jax.report.pictures import Illustration, Illustrations, curves
+from sqn_jax.report.play import worst_to_play
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.storage.run_folder import RunFolder
@@ -90,11 +92,15 @@ class Page(HTMLParser):
         return found
 
 
-def needs_nothing(page: Page) -> None:
-    """No tag of the page fetches, runs or leads anywhere."""
-    assert not {tag for tag, _ in page.tags} & {"script", "link", "a", "iframe", "object", "base"}
+def needs_nothing(page: Page, *links: str) -> None:
+    """No tag of the page fetches, runs or leads anywhere, but for links to these addresses."""
+    assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base"}
+    assert [attributes["href"] for tag, attributes in page.tags if tag == "a"] == list(links)
     for tag, attributes in page.tags:
         for name, value in attributes.items():
+            if tag == "a":
+                assert name == "href"
+                continue
             assert not name.startswith("on"), (tag, name)
             if name in ("src", "href", "srcset", "style", "action"):
                 assert (value or "").startswith("data:image/"), (tag, name, value)
@@ -296,7 +302,7 @@ def picture(kind: str) -> Illustration:
 
 def evil_content() -> Content:
     """A content in which every name is hostile."""
-    policy = Policy(EVIL, dataclasses.replace(TrainConfig(), map=EVIL), ({},))
+    policy = Policy(EVIL, TrainConfig(map=EVIL, seed=4), ({},))
     run = Run(EVIL, policy, [], {"device": EVIL, "versions": {EVIL: EVIL}})
     agent = TrainedAgent(EVIL, (policy,))
     batch = batch_of(world_of(hall(EVIL)), [line((1.05, 1.05), (2, 1), 4)], [(9.05, 1.05)], [0])
@@ -320,6 +326,21 @@ def test_hostile_names_are_text_and_nothing_else() -> None:
     whole = re.search(r"<pre>(.*?)</pre>", html, re.DOTALL)
     assert whole is not None
     assert json.loads(unescape(whole[1]))["map"] == EVIL
+
+
+def test_hostile_names_are_inert_in_the_page_to_play_on_and_in_the_link_to_it() -> None:
+    content = evil_content()
+    playable = worst_to_play(content, f"{EVIL}-play.html")
+    (link,) = playable.links
+    assert re.fullmatch(r"[\w%.,#=&-]+", str(link), re.ASCII)
+    assert unquote(str(link)).startswith(f"{EVIL}-play.html#map={EVIL}&start=1.05")
+    page = Page(
+        to_html(content, Illustrations([picture("PNG")], [], [], 0, picture("GIF")), [link])
+    )
+    needs_nothing(page, str(link))
+    tags = [tag for tag, _ in Page(playable.html).tags]
+    assert tags.count("script") == 2
+    assert "img" not in tags
 
 
 def test_the_first_sentence_tells_success_and_steps_of_each_map() -> None:
@@ -372,17 +393,41 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory, room_file: Path) -> Iterat
         yield path
 
 
+def begins_with_the_worst(html: str, page: Page, links: list[str]) -> None:
+    """The page beside a report has the task of its first episode; its links say those of all."""
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html)
+    assert data is not None
+    task = json.loads(data[1])["task"]
+    places = re.findall(r"from \((.*?), (.*?)\) m to the goal at \((.*?), (.*?)\) m", page.text)
+    assert len(places) == len(links) == 2
+    begun = [*task["start"][:2], *task["goal"]]
+    assert [f"{value:.1f}" for value in begun] == list(places[0])
+    for link, place in zip(links, places, strict=True):
+        file, _, fields = link.partition("#")
+        assert file == "my%201-play.html"
+        numbers = dict(field.split("=") for field in fields.split("&"))
+        assert numbers["map"] in html
+        said = [*numbers["start"].split(",")[:2], *numbers["goal"].split(",")]
+        assert [f"{float(value):.1f}" for value in said] == list(place)
+
+
 def test_a_report_on_a_run_is_the_same_twice_and_says_what_an_evaluation_says(
     run_dir: Path, room_file: Path, tmp_path: Path
 ) -> None:
     arguments = [str(run_dir), "--episodes", "2", "--eval-seeds", "1", "--epsilon", "0.5"]
-    for name in ("a.html", "b.html"):
-        assert main(["report", *arguments, "--out", str(tmp_path / name)]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "b.html"]
-    html = (tmp_path / "a.html").read_text(encoding="utf-8")
-    assert html == (tmp_path / "b.html").read_text(encoding="utf-8")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        assert main(["report", *arguments, "--out", str(tmp_path / name / "my 1.html")]) == 0
+    files = ["my 1-play.html", "my 1.html"]
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == files
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    html = (tmp_path / "a" / "my 1.html").read_text(encoding="utf-8")
     page = Page(html)
-    needs_nothing(page)
+    links = [str(attributes["href"]) for tag, attributes in page.tags if tag == "a"]
+    needs_nothing(page, *links)
+    plays = (tmp_path / "a" / "my 1-play.html").read_text(encoding="utf-8")
+    begins_with_the_worst(plays, page, links)
     images = page.images()
     # Two worst, the learning curve, the paths, the animation.
     assert [image.format for image in images] == ["PNG"] * 4 + ["GIF"]
