@@ -54,8 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run() -> NoReturn:
     """Run `main` and end the process with its exit code.
 
-    After a signal or a failure the process ends at once: threads of XLA or Orbax may still be
-    running, and would crash or print errors while Python shuts down.
+    After a signal, a failure or a refusal the process ends at once: threads of XLA or Orbax may
+    still be running, and would crash or print errors while Python shuts down, and JAX would wait
+    for other processes of a run.
     """
     end_at_once()
     streams.install()
@@ -66,9 +67,9 @@ def run() -> NoReturn:
     failure = streams.failure()
     if failure is not None and code == 0:
         code = _fail(failure) if failure else 1
-    if code == 1 or code > 128:
+    if code:
         os._exit(code)
-    sys.exit(code)
+    sys.exit(0)
 
 
 def _dispatch(arguments: list[str]) -> int:
