@@ -1,8 +1,9 @@
 """Aborts of the C++ libraries, as one line instead of their stack traces.
 
 JAX's coordination service aborts a process whose run has lost another one: no Python error is
-raised, and a page is printed. What C code prints as an error is held back here: when the process is
-aborted by that service a line takes its place, else it is shown at the end.
+raised, and a page is printed. What C code prints as an error is held back here. Where that service
+aborts the process a line takes its place; where an error is raised it says enough; else it is shown
+at the end.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def reported(line: str) -> Iterator[None]:
         finally:
             libc.signal(signal.SIGABRT, handler)
             stream.value = before
-            os.write(2, _text_of(printed))
+        os.write(2, _text_of(printed))
 
 
 def _text_of(file: IO[bytes]) -> bytes:

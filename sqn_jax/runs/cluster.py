@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,7 +17,7 @@ from sqn_jax.training.processes import Cluster, ProcessLost
 def joined(cluster: Cluster | None, device: str | None) -> Iterator[None]:
     """Start JAX's devices, and be one of the processes of a run within this context.
 
-    Only the first prints, but for errors and warnings. Those that end in order wait for each other.
+    Only the first prints, but for errors. Those that end in order wait for each other.
     One that fails does not: the others notice, and end too.
 
     Args:
@@ -52,6 +53,8 @@ def joined(cluster: Cluster | None, device: str | None) -> Iterator[None]:
 
 
 def _discard_output() -> None:
+    """Leave what is said, and warned of, to the first process."""
+    warnings.simplefilter("ignore")
     null_device = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null_device, 1)
     os.close(null_device)

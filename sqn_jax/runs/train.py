@@ -186,8 +186,6 @@ def _run_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Iterator[Ru
         with processes.together():
             if processes.is_first():
                 stack.enter_context(locked(run_dir))
-                if not resume:
-                    RunFolder.create(run_dir, config)
         owner = processes.gather(lock.owner(run_dir))[0]
         with processes.together():
             deadline = time.monotonic() + SHARED_SECONDS
@@ -198,6 +196,9 @@ def _run_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Iterator[Ru
                         "machines share"
                     )
                 time.sleep(0.5)
+        with processes.together():
+            if processes.is_first() and not resume:
+                RunFolder.create(run_dir, config)
         yield RunFolder(run_dir)
 
 

@@ -105,6 +105,8 @@ def describe(mesh: Mesh | None = None) -> str:
     device = jax.devices()[0]
     kind = cpu_model() if device.platform == "cpu" else device.device_kind
     times = "" if mesh is None else f" x {mesh.size}"
+    if mesh is not None and (count := jax.process_count()) > 1:
+        times += f" in {count} processes"
     return f"{device.platform} ({kind}){times}"
 
 
