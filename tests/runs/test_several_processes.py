@@ -94,7 +94,8 @@ def assert_alike(runs: TinyRuns, run: str, other: str) -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyRuns:
-    return TinyRuns(tmp_path_factory.mktemp("tiny"), chunks=4, eval__curve_points="1")
+    folder = tmp_path_factory.mktemp("tiny")
+    return TinyRuns(folder, chunks=4, eval__curve_points="0", network__num_skills="2")
 
 
 def test_two_processes_make_the_run_that_one_makes(tiny: TinyRuns) -> None:
