@@ -1,8 +1,8 @@
 """How a run grows from one device to several, and from one process to two on this machine.
 
-    python experiments/scaling.py --out FILE
+    python -m experiments.scaling --out FILE
 
-Each row trains the preset `quick` in processes of its own, which have nothing else to do. Of the
+Each row trains the preset `quick` in processes of its own, with one core for each device. Of the
 time on one device, a part stays whatever the number of devices (Amdahl's law): with T1 seconds a
 round on one and T2 on two, 2 T2 / T1 - 1 of T1.
 """
@@ -13,7 +13,6 @@ import argparse
 import dataclasses
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -69,8 +68,7 @@ def main() -> None:
 
 def measured(count: int, of_each: int, repeats: int) -> dict[str, Any]:
     """Start the processes of one layout; what the first has measured."""
-    with socket.create_server(("localhost", 0)) as server:
-        port = server.getsockname()[1]
+    port = 20_000 + (os.getpid() + 10 * count + of_each) % 10_000
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": str(of_each)}
     command = [sys.executable, "-m", "experiments.scaling", "--repeats", str(repeats), "--worker"]
     started = [
@@ -91,6 +89,8 @@ def measured(count: int, of_each: int, repeats: int) -> dict[str, Any]:
 
 def work(cluster: Cluster, of_each: int, repeats: int) -> None:
     """Be one of the processes of a layout: train, and print the times of the rounds."""
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, cores[of_each * int(cluster.process_id or 0) :][:of_each])
     processes.join(cluster)
     count = jax.process_count()
     mesh = devices.choose(CONFIG, count * of_each)

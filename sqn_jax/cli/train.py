@@ -141,9 +141,9 @@ def _resumed_config(
     excess += ([f"--preset {options.preset}"] if options.preset else []) + unknown
     if excess:
         raise ValueError(
-            "--resume takes every setting from the run folder, expected no option but --map, "
-            "--run-dir, --total-episodes, --device, --num-devices, --tensorboard and those of "
-            "several processes, got "
+            "--resume takes every setting from the run folder, expected no option but those "
+            "of several processes, --map, --run-dir, --total-episodes, --device, --num-devices and "
+            "--tensorboard, got "
             f"{' '.join(excess)}"
         )
     from sqn_jax.storage.run_folder import RunFolder

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 import re
-import socket
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,6 +21,12 @@ from jax.experimental import multihost_utils
 
 HEARTBEAT_SECONDS = 60
 """How long a process may be silent; one that has ended is noticed at once."""
+
+TCP_TABLES = ("/proc/net/tcp", "/proc/net/tcp6")
+"""Where Linux lists connections."""
+
+LISTENS = "0A"
+"""State of a port there."""
 
 LONGEST_WAIT_SECONDS = 24 * 3600
 """How long the others wait while the first evaluates and draws."""
@@ -143,13 +149,23 @@ def require_as_many_devices() -> None:
 def _require_free_port(address: str) -> None:
     """JAX crashes where it is in use."""
     port = int(address.rpartition(":")[2])
-    try:
-        with socket.create_server(("", port)):
-            pass
-    except OSError as error:
+    if port in _listening_ports():
         raise ValueError(
-            f"--coordinator {address}: port {port} cannot be opened here ({error.strerror})"
-        ) from None
+            f"--coordinator {address}: port {port} is in use here, expected a free one of the "
+            "machine of process 0"
+        )
+
+
+def _listening_ports() -> set[int]:
+    """TCP ports of this machine that somebody listens on; none where the system does not say."""
+    ports = set()
+    for table in TCP_TABLES:
+        with suppress(OSError):
+            for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
+                _, local, _, state = line.split()[:4]
+                if state == LISTENS:
+                    ports.add(int(local.rpartition(":")[2], 16))
+    return ports
 
 
 def leave() -> None:
