@@ -6,6 +6,7 @@ The run in one process is the oracle.
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -174,3 +175,31 @@ def test_processes_that_do_not_meet_or_agree_say_so_in_one_line(
     elsewhere = start(tiny, "here", alter=["--run-dir", str(tmp_path / "there")])
     codes = [(code, err.count("\n")) for code, _, err in ended(elsewhere)]
     assert codes == [(2, 1), (2, 1)]
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_slurm_says_where_the_processes_are(tiny: TinyRuns) -> None:
+    """They differ in their seeds, so that no run need be trained to see that they have met."""
+    slurm = {"JOB_ID": os.getpid(), "STEP_NODELIST": "localhost", "NTASKS": 2}
+    started = []
+    for process in range(2):
+        places = {**slurm, "PROCID": process, "LOCALID": process}
+        started.append(
+            subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "sqn_jax", *tiny.arguments("slurm")),
+                    *("--num-devices", "4", "--distributed", "auto", "--seed", str(process)),
+                ],
+                env={
+                    **tiny.environment,
+                    **{f"SLURM_{name}": str(value) for name, value in places.items()},
+                    "JAX_NUM_CPU_DEVICES": "2",
+                },
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+    for code, _, err in ended(started):
+        assert (code, err) == (2, "sqn: process 1: seed is 1, expected 0 as in process 0\n")
