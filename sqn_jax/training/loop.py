@@ -185,9 +185,17 @@ def _train_chunk_on_each(
 
     if program.config.num_seeds == 1:
         return rounds(runner)
-    runner, metrics = jax.vmap(rounds)(runner)
+    runner, metrics = _for_each_seed(rounds, runner)
     gather = partial(all_shards, axis_name=program.seed_axis_name)
     return runner, jax.tree.map(gather, metrics)
+
+
+def _for_each_seed(function: Callable[..., Any], runner: RunnerState) -> Any:
+    """Side by side; one alone as a run of one seed, whose branches can be left out."""
+    if runner.key.shape[0] > 1:
+        return jax.vmap(function)(runner)
+    results = function(jax.tree.map(lambda x: x[0], runner))
+    return jax.tree.map(lambda x: x[None], results)
 
 
 _jitted_train_chunk = jax.jit(train_chunk, static_argnames="program", donate_argnames="runner")
