@@ -9,7 +9,7 @@ import optax
 from jax.sharding import Mesh
 
 from sqn_jax.agent.networks import QNetwork, make_network
-from sqn_jax.agent.shards import AXIS
+from sqn_jax.agent.shards import AXIS, SEEDS
 from sqn_jax.config import LearnerConfig, TrainConfig
 from sqn_jax.config.validation import require
 
@@ -32,7 +32,7 @@ class Program:
     num_actions: int
     """A."""
     mesh: Mesh | None = None
-    """The devices that the robots are divided between; None for one alone."""
+    """The devices that seeds and robots are divided between; None for one alone."""
 
     def __post_init__(self) -> None:
         learner, steps = self.config.learner, f"the episode's {self.max_steps} steps"
@@ -72,8 +72,13 @@ class Program:
 
     @property
     def axis_name(self) -> str | None:
-        """Of the devices, for what they do together; None for one alone."""
-        return None if self.mesh is None else AXIS
+        """Of the devices that share a seed, for what they do together; None for one alone."""
+        return None if self.mesh is None or self.mesh.shape[AXIS] == 1 else AXIS
+
+    @property
+    def seed_axis_name(self) -> str | None:
+        """Of the devices that have seeds of their own; None where all have all."""
+        return None if self.mesh is None or self.mesh.shape[SEEDS] == 1 else SEEDS
 
     @property
     def window_length(self) -> int:

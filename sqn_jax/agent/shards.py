@@ -14,7 +14,10 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 AXIS = "devices"
-"""Name of the axis of a run's devices."""
+"""Name of the axis of the devices that share the robots of a seed."""
+
+SEEDS = "seeds"
+"""Name of the axis of the groups of devices that have seeds of their own."""
 
 
 def own_shard(tree: Any, axis_name: str | None, axis: int = 0) -> Any:

@@ -57,7 +57,8 @@ def run() -> NoReturn:
     """Run `main` and end the process with its exit code, at once: all files are written.
 
     To take down what JAX has traced takes Python a second, and after a signal or a failure threads
-    of XLA or Orbax may still be running, which would crash or print errors meanwhile.
+    of XLA or Orbax may still be running, which would crash or print errors meanwhile, and JAX would
+    wait for other processes of a run.
     """
     end_at_once()
     streams.install()

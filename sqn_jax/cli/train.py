@@ -15,6 +15,7 @@ from typing import Any
 
 from sqn_jax import config as configs
 from sqn_jax.cli.arguments import CACHE, Parser, add_device, folder, integer
+from sqn_jax.cli.processes import OPTIONS, add_processes, cluster_of
 from sqn_jax.cli.settings import add_settings, normalized, option, with_settings
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.map_names import MapFile
@@ -88,9 +89,11 @@ def _parser() -> Parser:
         "--num-devices",
         type=integer,
         metavar="N",
-        help="divide the robots between N cores of the CPU or N accelerators (default: as many "
-        "cores as speed it up, or one accelerator)",
+        help="divide seeds, then robots between N cores of the CPU or N accelerators, of all "
+        "processes together (default: as many cores as speed it up, or one accelerator; all of "
+        "several processes)",
     )
+    add_processes(parser)
     add(
         "--tensorboard",
         action="store_true",
@@ -138,8 +141,9 @@ def _resumed_config(
     excess += ([f"--preset {options.preset}"] if options.preset else []) + unknown
     if excess:
         raise ValueError(
-            "--resume takes every setting from the run folder, expected no option but --map, "
-            "--run-dir, --total-episodes, --device, --num-devices and --tensorboard, got "
+            "--resume takes every setting from the run folder, expected no option but those "
+            "of several processes, --map, --run-dir, --total-episodes, --device, --num-devices and "
+            "--tensorboard, got "
             f"{' '.join(excess)}"
         )
     from sqn_jax.storage.run_folder import RunFolder
@@ -185,12 +189,13 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 
 def _run_training(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> int:
-    from sqn_jax.training import devices
+    from sqn_jax.runs.cluster import joined
 
-    devices.use_cores()
-    devices.require(options.device)
     config = _with_absolute_paths(config)
-    with nullcontext(run_dir) if options.run_dir else _new_folder(run_dir) as folder:
+    with (
+        joined(cluster_of(options), options.device),
+        nullcontext(run_dir) if options.run_dir else _new_folder(run_dir) as folder,
+    ):
         _train(config, folder, options)
     return 0
 
@@ -201,7 +206,7 @@ def _train(config: TrainConfig, run_dir: Path, options: argparse.Namespace) -> N
     from sqn_jax.storage.run_folder import resume_command
 
     same = ""
-    for name in ("device", "num_devices"):  # With others the results would differ.
+    for name in ("device", "num_devices", *OPTIONS):  # With others the results would differ.
         value = getattr(options, name)
         same += "" if value is None else f" --{name.replace('_', '-')} {value}"
     try:

@@ -17,6 +17,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin, leaves_of
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
+from sqn_jax.training.devices import put
 from sqn_jax.training.state import RunnerState, params_shapes
 
 WhichParams = Literal["shipped", "latest", "average", "target"]
@@ -144,7 +145,7 @@ def started_from(runner: RunnerState, policy: Policy) -> RunnerState:
 
     def filled(fresh: Params) -> Params:
         return jax.tree.map(
-            lambda mine, theirs: jax.device_put(
+            lambda mine, theirs: put(
                 jnp.array(jnp.broadcast_to(theirs, mine.shape)), mine.sharding
             ),
             fresh,

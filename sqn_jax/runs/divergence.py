@@ -11,6 +11,7 @@ from sqn_jax.agent.learner import LearnerState
 from sqn_jax.config import TrainConfig
 from sqn_jax.storage.manifest import leaves_of
 from sqn_jax.storage.run_folder import RunFolder
+from sqn_jax.training import devices, processes
 
 DUMP = "divergence.json"
 SHOWN_ROWS = 20
@@ -23,7 +24,7 @@ class Diverged(FloatingPointError):
 def raise_if_diverged(
     row: Mapping[str, Any], learner: LearnerState, config: TrainConfig, folder: RunFolder
 ) -> None:
-    """Stop a run that has diverged, before this chunk is saved.
+    """Stop a run that has diverged, before this chunk is saved; called in all its processes.
 
     Single updates with a loss or gradient that is not finite have been skipped already.
 
@@ -50,18 +51,20 @@ def raise_if_diverged(
         )
     else:
         reason = "parameters are no longer finite"
-    folder.write_json(
-        DUMP,
-        {
-            "chunk": row["chunk"],
-            "episodes": row["episodes"],
-            "seeds": [config.seed + int(index) for index in np.flatnonzero(has_diverged)],
-            "why": reason,
-            "learning_rate": config.learner.learning_rate,
-            "arrays": _arrays(learner, index if config.num_seeds > 1 else None),
-            "last_rows": folder.read_metrics()[-SHOWN_ROWS:],
-        },
-    )
+    arrays = _arrays(learner, index if config.num_seeds > 1 else None)
+    if processes.is_first():
+        folder.write_json(
+            DUMP,
+            {
+                "chunk": row["chunk"],
+                "episodes": row["episodes"],
+                "seeds": [config.seed + int(index) for index in np.flatnonzero(has_diverged)],
+                "why": reason,
+                "learning_rate": config.learner.learning_rate,
+                "arrays": arrays,
+                "last_rows": folder.read_metrics()[-SHOWN_ROWS:],
+            },
+        )
     raise Diverged(
         f"stopped at chunk {row['chunk']}, seed {seed}: {reason}; {folder.path / DUMP} says where. "
         "What was saved before is finite"
@@ -73,7 +76,8 @@ def _arrays(learner: LearnerState, index: int | None) -> dict[str, dict[str, Any
     arrays = {}
     parts = {"params": learner.params, "opt_state": learner.opt_state}
     for path, leaf in leaves_of(parts):
-        values = np.asarray(leaf if index is None else leaf[index], dtype=np.float64)
+        whole = devices.on_host(leaf)
+        values = np.asarray(whole if index is None else whole[index], dtype=np.float64)
         is_finite = np.isfinite(values)
         arrays[path] = {
             "largest": float(np.abs(values[is_finite]).max(initial=0.0)),

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import sqn_jax
-from sqn_jax.agent.learner import policy_params
+from sqn_jax.agent.networks import Params
 from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
@@ -20,7 +20,6 @@ from sqn_jax.outside.messages import say
 from sqn_jax.policies.run_policies import Policy, seeds_of
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training import devices, memory_budget
-from sqn_jax.training.state import RunnerState
 
 FIELDS = ("output",)
 """What the figures need of the steps, beside the poses."""
@@ -52,12 +51,12 @@ def require_memory(program: Program) -> None:
 
 
 def evaluate_run(
-    runner: RunnerState, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
+    params: Params, occupancy_map: OccupancyMap, config: TrainConfig, folder: RunFolder
 ) -> tuple[list[dict[str, Any]], list[EpisodeBatch]]:
     """Run greedy episodes of every training seed, between evaluation points and random pairs.
 
     Args:
-        runner: the final state.
+        params: those of the policy, of all training seeds.
         occupancy_map: the first map of the run.
         config: the config of the run.
         folder: the run folder.
@@ -66,7 +65,7 @@ def evaluate_run(
         The results, and the episodes of the first seed for each kind of task.
     """
     # On one device; otherwise every program that uses them would run on all of the mesh.
-    params = jax.device_put(policy_params(runner.learner, config), jax.devices()[0])
+    params = jax.device_put(params, jax.local_devices()[0])
     policy = Policy(folder.path.name, config, seeds_of(params, config))
     of_first_seed: list[EpisodeBatch] = []
 

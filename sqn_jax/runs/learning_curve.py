@@ -24,6 +24,7 @@ from sqn_jax.evaluation.settings import World, robot_for, worlds
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.runs.final_evaluation import settings_of
 from sqn_jax.storage.metrics import evaluated_rows
+from sqn_jax.training import devices, processes
 from sqn_jax.training.state import network_of
 
 CURVE_STREAM = 3
@@ -56,17 +57,20 @@ class LearningCurve:
     def point(self, chunk: int, learner: LearnerState) -> dict[str, Any]:
         """The means over the episodes by the names of `METRICS`, a list where there are seeds.
 
-        After a chunk that is no point of the curve they are NaN.
+        After a chunk that is no point of the curve they are NaN, and in all processes of a run but
+        the first, which evaluates alone.
         """
         num_seeds = self._config.num_seeds
         means = {name: [math.nan] * num_seeds for name in METRICS}
         if is_point(chunk, self._config):
             started = time.perf_counter()
-            means = self._evaluate(learner)
+            params = stacked_params(learner, self._config)
+            if processes.is_first():
+                means = self._evaluate(params)
             self.seconds += time.perf_counter() - started
         return {name: values[0] if num_seeds == 1 else values for name, values in means.items()}
 
-    def _evaluate(self, learner: LearnerState) -> dict[str, list[float]]:
+    def _evaluate(self, params: Params) -> dict[str, list[float]]:
         config = self._config
         if self._world is None:
             settings = settings_of(config)
@@ -75,7 +79,7 @@ class LearningCurve:
             self._world = next(worlds(robot, maps, settings))
         results = run_seeds(
             curve_keys(config),
-            stacked_params(learner, config),
+            params,
             self._world.env_params,
             network_of(config),
         )
@@ -93,7 +97,7 @@ def curve_keys(config: TrainConfig) -> jax.Array:
 
 def stacked_params(learner: LearnerState, config: TrainConfig) -> Params:
     """The policies to ship, [S, ...] on the host: the state itself is given to the next chunk."""
-    params = jax.tree.map(np.array, jax.device_get(policy_params(learner, config)))
+    params = jax.tree.map(np.array, devices.on_host(policy_params(learner, config)))
     return params if config.num_seeds > 1 else jax.tree.map(lambda x: x[None], params)
 
 

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from sqn_jax.outside.messages import say
 
 
-def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
+def episodes_bar(total: int, done: int = 0, *, is_shown: bool = True) -> tqdm[Any]:
     """A progress bar over episodes; updated less often where stderr is not a terminal."""
     return tqdm(
         total=total,
@@ -18,7 +18,7 @@ def episodes_bar(total: int, done: int = 0) -> tqdm[Any]:
         mininterval=0.5 if sys.stderr is not None and sys.stderr.isatty() else 20,
         smoothing=0.1,
         dynamic_ncols=True,
-        disable=sys.stderr is None,  # A process may be started without one.
+        disable=sys.stderr is None or not is_shown,  # A process may be started without one.
         bar_format="{percentage:3.0f}%|{bar:12}| {n_fmt}/{total_fmt} episodes "
         "[{elapsed}, {remaining} left{postfix}]",
     )

@@ -5,19 +5,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-import os
 import signal
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
+from sqn_jax import config as configs
+from sqn_jax.agent.learner import policy_params
+from sqn_jax.agent.networks import Params
 from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.map_names import MapFile
@@ -31,15 +34,16 @@ from sqn_jax.policies.run_policies import Policy, require_same_network, started_
 from sqn_jax.runs import divergence, final_evaluation, streams
 from sqn_jax.runs.learning_curve import LearningCurve, summary_of
 from sqn_jax.runs.progress import episodes_bar, phase
+from sqn_jax.runs.resuming import restored
 from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
-from sqn_jax.storage import manifest
+from sqn_jax.storage import lock, manifest
 from sqn_jax.storage.checkpoint import Checkpoints, chunks_in
 from sqn_jax.storage.compile_cache import cached_programs, watched_compilation
 from sqn_jax.storage.lock import locked
-from sqn_jax.storage.manifest import Manifest, Origin
-from sqn_jax.storage.run_folder import CHECKPOINTS, SUMMARY, RunFolder, require_usable
-from sqn_jax.training import devices, memory_budget
+from sqn_jax.storage.manifest import Origin
+from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder, require_usable
+from sqn_jax.training import devices, memory_budget, processes
 from sqn_jax.training.loop import (
     ChunkReport,
     CompiledChunk,
@@ -47,10 +51,12 @@ from sqn_jax.training.loop import (
     make_program,
     rounds_done,
     run,
-    runner_shapes,
     start_run,
 )
 from sqn_jax.training.state import RunnerState, memory_bytes
+
+SHARED_SECONDS = 20
+"""How long a file may take from one machine to the others."""
 
 MAX_PICTURE_BYTES = 2**25
 """Size of a figure for TensorBoard, at most."""
@@ -85,6 +91,64 @@ def train_session(
         Diverged: the run has diverged.
         Interrupted: a signal stopped the run; the current chunk was finished and saved.
     """
+    with processes.together():
+        setup = _set_up(config, run_dir, resume, num_devices, tensorboard)
+    program, first_map = setup.program, _first_map(config, setup.occupancy_map)
+    world = setup.occupancy_map.identity()
+    processes.require_same(_description(config, world, resume, program.mesh))
+    with ExitStack() as stack:
+        folder = stack.enter_context(_run_folder(run_dir, config, resume))
+        origin = Origin(config, world, 1 if program.mesh is None else program.mesh.size)
+        checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
+        runner = restored(program, folder, checkpoints) if resume else None
+        _announce(program, run_dir, setup.num_bytes, resume_command)
+        done = 0 if runner is None else rounds_done(runner) * config.num_envs
+        has_board = tensorboard and processes.is_first()
+        board = stack.enter_context(Board(run_dir, done)) if has_board else None
+        curve = LearningCurve(first_map, config)
+        training = _Training(setup, folder, checkpoints, resume_command, curve)
+        runner = training.run(runner, None if board is None else board.scalars)
+        params = devices.on_host(policy_params(runner.learner, config))
+        if processes.is_first():
+            _finish(params, first_map, config, folder, board, training.timing)
+
+
+def _finish(
+    params: Params,
+    first_map: OccupancyMap,
+    config: TrainConfig,
+    folder: RunFolder,
+    board: Board | None,
+    timing: dict[str, float],
+) -> None:
+    """Evaluate what was trained, draw it, and say what it came to."""
+    phase(f"evaluating on {first_map.name}")
+    results, batches = final_evaluation.evaluate_run(params, first_map, config, folder)
+    phase("drawing")
+    has_figures = final_evaluation.draw_figures(batches, first_map, config, folder)
+    if board is not None and has_figures:
+        _add_figures(board, config, folder)
+    last = summary_of(folder.read_metrics(), config)
+    final_evaluation.conclude(results, timing, has_figures, config, folder, last)
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What a run needs before its first file."""
+
+    occupancy_map: OccupancyMap
+    env_params: EnvParams
+    program: Program
+    num_bytes: int
+    """Of the episodes in memory."""
+    start: Policy | None
+    """Where the parameters of a new run come from, if not from its seed."""
+
+
+def _set_up(
+    config: TrainConfig, run_dir: Path, resume: bool, num_devices: int | None, tensorboard: bool
+) -> _Setup:
+    """Everything that may be refused before files are left behind."""
     require_usable(run_dir)
     memory_budget.bound_programs()
     devices.use_cores()
@@ -93,7 +157,6 @@ def train_session(
     env_params = make_env(occupancy_map, config.env)
     _warn_of_short_episodes(occupancy_map, config)
     program = make_program(env_params, config, mesh)
-    # Errors up to here leave no files behind.
     num_bytes = memory_bytes(program)
     memory_budget.require(num_bytes, "keeping its episodes", config.method)
     final_evaluation.require_memory(program)
@@ -101,27 +164,43 @@ def train_session(
         require_tensorboard()
     is_saved = resume and bool(chunks_in(run_dir / CHECKPOINTS))
     start = None if is_saved else _starting_policy(config)
-    origin = Origin(config, occupancy_map.identity(), 1 if mesh is None else mesh.size)
+    return _Setup(occupancy_map, env_params, program, num_bytes, start)
+
+
+def _description(
+    config: TrainConfig, world: dict[str, Any], resume: bool, mesh: Mesh | None
+) -> dict[str, Any]:
+    """What all processes of a run must agree on."""
+    return {
+        **manifest.versions(),
+        **configs.flat(configs.to_dict(config)),
+        **configs.flat(world, "map."),
+        "--resume": resume,
+        "--num-devices": 1 if mesh is None else mesh.size,
+    }
+
+
+@contextmanager
+def _run_folder(run_dir: Path, config: TrainConfig, resume: bool) -> Iterator[RunFolder]:
+    """The folder, locked and for a new run made by the first process; all are to see it."""
     with ExitStack() as stack:
-        stack.enter_context(locked(run_dir))
-        folder = RunFolder(run_dir) if resume else RunFolder.create(run_dir, config)
-        checkpoints = stack.enter_context(Checkpoints(run_dir, origin))
-        runner = _restored(program, folder, checkpoints) if resume else None
-        _announce(program, run_dir, num_bytes, resume_command)
-        done = 0 if runner is None else rounds_done(runner) * config.num_envs
-        board = stack.enter_context(Board(run_dir, done)) if tensorboard else None
-        first_map = _first_map(config, occupancy_map)
-        curve = LearningCurve(first_map, config)
-        training = _Training(env_params, program, folder, checkpoints, start, resume_command, curve)
-        runner = training.run(runner, None if board is None else board.scalars)
-        phase(f"evaluating on {first_map.name}")
-        results, batches = final_evaluation.evaluate_run(runner, first_map, config, folder)
-        phase("drawing")
-        has_figures = final_evaluation.draw_figures(batches, first_map, config, folder)
-        if board is not None and has_figures:
-            _add_figures(board, config, folder)
-    last = summary_of(folder.read_metrics(), config)
-    final_evaluation.conclude(results, training.timing, has_figures, config, folder, last)
+        with processes.together():
+            if processes.is_first():
+                stack.enter_context(locked(run_dir))
+        owner = processes.gather(lock.owner(run_dir))[0]
+        with processes.together():
+            deadline = time.monotonic() + SHARED_SECONDS
+            while lock.owner(run_dir) != owner:
+                if time.monotonic() > deadline:
+                    raise ValueError(
+                        f"run folder {run_dir}: is not that of process 0, expected one that all "
+                        "machines share"
+                    )
+                time.sleep(0.5)
+        with processes.together():
+            if processes.is_first() and not resume:
+                RunFolder.create(run_dir, config)
+        yield RunFolder(run_dir)
 
 
 def _warn_of_short_episodes(occupancy_map: OccupancyMap, config: TrainConfig) -> None:
@@ -176,7 +255,8 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: s
     if config.start_from:
         say(f"starting from {config.start_from}")
     say(
-        f"run folder {run_dir}, device {devices.describe(program.mesh)}, "
+        f"run folder {run_dir}, device {devices.describe(program.mesh)}"
+        f"{devices.describe_division(program.mesh, config.num_seeds)}, "
         f"episodes in memory {num_bytes / 1e6:,.1f} MB"
     )
     if config.method == "r2d2" and not config.checkpoint_replay:
@@ -185,90 +265,22 @@ def _announce(program: Program, run_dir: Path, num_bytes: int, resume_command: s
         say(f"if it is stopped, resume with {resume_command}", flush=True)
 
 
-def _restored(program: Program, folder: RunFolder, checkpoints: Checkpoints) -> RunnerState | None:
-    """The state to resume from; None if the run was stopped before its first checkpoint.
-
-    Also writes the config to the folder and drops the metrics of chunks after the checkpoint.
-    """
-    config = program.config
-    runner, chunks = None, 0
-    folder.sweep()
-    if checkpoints.chunks():
-        runner, saved = checkpoints.restore(runner_shapes(program))
-        chunks = rounds_done(runner) // config.rounds_per_chunk
-        if chunks > config.num_chunks:
-            episodes = chunks * config.rounds_per_chunk * config.num_envs
-            raise ValueError(
-                f"total_episodes is {config.total_episodes}, expected at least the {episodes} that "
-                f"the run in {folder.path} has done"
-            )
-        say(f"resuming after {chunks} of {config.num_chunks} chunks")
-        _report_changes(saved, 1 if program.mesh is None else program.mesh.size)
-        if config.method == "r2d2" and runner.learner.memory is None:
-            say("saved without the replay: resuming with an empty one, not exactly as before")
-            memory = start_run(program).learner.memory
-            learner = dataclasses.replace(runner.learner, memory=memory)
-            runner = dataclasses.replace(runner, learner=learner)
-    else:
-        _require_none_lost(folder, config)
-        say("stopped before its first checkpoint: starting from the beginning")
-    rows = folder.rows_of(chunks, config)
-    folder.write_config(config)
-    folder.write_metrics(rows)
-    if chunks < config.num_chunks:
-        folder.unfinish()
-    return runner
-
-
-def _require_none_lost(folder: RunFolder, config: TrainConfig) -> None:
-    """Refuse to start from the beginning if there must have been checkpoints."""
-    checkpoints = folder.path / CHECKPOINTS
-    is_no_folder = os.path.lexists(checkpoints) and not checkpoints.is_dir()
-    if (
-        is_no_folder
-        or any(checkpoints.glob("*.damaged"))
-        or (folder.path / SUMMARY).exists()
-        or folder.train_seconds() > 120 * config.checkpoint_minutes
-    ):
-        raise ValueError(
-            f"{checkpoints}: holds no checkpoint that can be used, but the run had some; put "
-            "them back, or start a new run in another folder"
-        )
-
-
-def _report_changes(saved: Manifest, num_devices: int) -> None:
-    """Print what has changed of machine and versions; the run is then not the same to the bit."""
-    old = {**saved.contents["versions"], "device": saved.contents["device"]}
-    new = {**manifest.versions(), "device": devices.describe()}
-    old["devices"], new["devices"] = str(saved.contents["num_devices"]), str(num_devices)
-    changed = [name for name in ("jax", "device", "devices", "sqn_jax") if old[name] != new[name]]
-    if changed:
-        saved_under = ", ".join(f"{name} {old[name]}" for name in changed)
-        resumed_under = ", ".join(f"{name} {new[name]}" for name in changed)
-        say(
-            f"saved under {saved_under}; resuming under {resumed_under}: "
-            "the results will not be the same bit for bit"
-        )
-
-
 class _Training:
     """The training of a run to its end, with metrics and checkpoints."""
 
     def __init__(
         self,
-        env_params: EnvParams,
-        program: Program,
+        setup: _Setup,
         folder: RunFolder,
         checkpoints: Checkpoints,
-        start: Policy | None,
         resume_command: str,
         curve: LearningCurve,
     ) -> None:
-        config, mesh = program.config, program.mesh
-        self._env_params, self._program, self._config = env_params, program, config
-        self._start, self._resume_command = start, resume_command
+        self._env_params, self._program, self._start = setup.env_params, setup.program, setup.start
+        config, mesh = setup.program.config, setup.program.mesh
+        self._config, self._resume_command = config, resume_command
         self._folder, self._checkpoints, self._curve = folder, checkpoints, curve
-        self._steps_a_round = config.num_envs * config.num_seeds * env_params.max_steps
+        self._steps_a_round = config.num_envs * config.num_seeds * setup.env_params.max_steps
         self.timing: dict[str, float] = {
             "train_seconds": folder.train_seconds(),
             "env_steps": 0.0,
@@ -295,7 +307,8 @@ class _Training:
                 runner = started_from(runner, self._start)
         total = config.num_rounds * config.num_envs
         message = "stopping after this chunk and saving"
-        with deferred(message) as received, episodes_bar(total, done * config.num_envs) as bar:
+        bar = episodes_bar(total, done * config.num_envs, is_shown=processes.is_first())
+        with deferred(message) as received, bar:
             for runner, report in run(runner, self._env_params, self._program, compiled):  # noqa: B020
                 row = self._write_row(report, runner)
                 if on_row is not None:
@@ -305,25 +318,31 @@ class _Training:
                 divergence.raise_if_diverged(row, runner.learner, config, self._folder)
                 if streams.reader_left():  # As a closed terminal would.
                     received.append(signal.SIGPIPE)
-                is_due = time.monotonic() - self._saved_at > 60 * config.checkpoint_minutes
-                if received or is_due or report.chunk == config.num_chunks:
+                number, is_due = self._agreed(received)
+                if number or is_due or report.chunk == config.num_chunks:
                     self._save(report.chunk, runner)
-                if received:
-                    break
-        if received:
-            raise Interrupted(received[0], self._resume_command)
+                    number, _ = self._agreed(received)
+                if number:
+                    raise Interrupted(number, self._resume_command)
         return runner
+
+    def _agreed(self, received: list[int]) -> tuple[int, bool]:
+        """The signal that any process of the run was sent, or 0, and whether it is time to save."""
+        is_due = time.monotonic() - self._saved_at > 60 * self._config.checkpoint_minutes
+        reports = processes.gather([received[0] if received else 0, is_due])
+        return max(number for number, _ in reports), reports[0][1]
 
     def _compile(self) -> CompiledChunk:
         """Compile a chunk; refuse what does not fit into memory."""
         say("compiling ...", end="", flush=True)
-        with watched_compilation() as was_read:
-            compiled, seconds = compile_chunk(self._env_params, self._program)
-        self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
-        how = "compiled earlier, read" if was_read() else "compiled"
-        say(f"{how} in {seconds:.1f} s", start="\r")
-        needed = memory_budget.compiled_bytes(compiled)
-        memory_budget.require(needed, "training", self._config.method)
+        with processes.together():
+            with watched_compilation() as was_read:
+                compiled, seconds = compile_chunk(self._env_params, self._program)
+            self.timing |= {"compile_seconds": seconds, "compiled_earlier": was_read()}
+            how = "compiled earlier, read" if was_read() else "compiled"
+            say(f"{how} in {seconds:.1f} s", start="\r")
+            needed = memory_budget.compiled_bytes(compiled)
+            memory_budget.require(needed, "training", self._config.method)
 
         def run_chunk(
             runner: RunnerState, env_params: EnvParams
@@ -342,12 +361,14 @@ class _Training:
         row = _row(report, self.timing["train_seconds"], self._program)
         row |= self._curve.point(report.chunk, runner.learner)
         self.timing["curve_seconds"] = self._curve.seconds
-        self._folder.append_metrics(row)
+        if processes.is_first():
+            self._folder.append_metrics(row)
         return row
 
     def _save(self, chunk: int, runner: RunnerState) -> None:
         """Write a checkpoint; its rows of metrics are flushed to the disk before."""
-        self._folder.flush_metrics()
+        if processes.is_first():
+            self._folder.flush_metrics()
         score = float(np.mean(self._successes))
         light = not self._config.checkpoint_replay
         self._checkpoints.save(chunk, runner, score=score, light=light)

@@ -5,7 +5,8 @@ manifest (`manifest.py`) that is compared with it before anything is used. The p
 policy stand apart, so that it can be loaded without the rest; so does the replay, which can be left
 out.
 
-A step is written under a hidden name and renamed once all of it is on the disk.
+A step is written under a hidden name and renamed once all of it is on the disk. Of a run in several
+processes each writes and reads what its devices have; the first does the rest.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from sqn_jax.storage import manifest
 from sqn_jax.storage.files import flush_folder
 from sqn_jax.storage.manifest import Damaged, Manifest, Mismatch, Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS
+from sqn_jax.training import processes
 from sqn_jax.training.state import RunnerState
 
 NUM_NEWEST = 2
@@ -77,6 +79,8 @@ class Checkpoints:
     ) -> None:
         """Write the state after `chunk` chunks; on the disk when this returns.
 
+        All processes of a run are to call it, as `restore` and `restore_policy`.
+
         Args:
             chunk: chunks done.
             runner: the state.
@@ -92,19 +96,30 @@ class Checkpoints:
             del items["memory"]
         partial = self._folder / f".{chunk}.partial"
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._sweep()
-            _require_space(self._folder, items)
+            with processes.together():
+                if processes.is_first():
+                    self._folder.mkdir(parents=True, exist_ok=True)
+                    self._sweep()
+                    _require_space(self._folder, items)
             arguments = {name: ocp.args.StandardSave(item) for name, item in items.items()}
             self._orbax.save(partial, args=ocp.args.Composite(**arguments))
-            manifest.write(partial, items, self._origin, chunk=chunk, score=score, exact=exact)
-            self._set_aside(chunk)
-            partial.rename(self._place(chunk))
-            flush_folder(self._folder)
+            leaves = manifest.describe_leaves(items)
+            with processes.together():
+                if processes.is_first():
+                    manifest.write(
+                        partial, leaves, self._origin, chunk=chunk, score=score, exact=exact
+                    )
+                    self._set_aside(chunk)
+                    partial.rename(self._place(chunk))
+                    flush_folder(self._folder)
         except Exception as error:  # Orbax raises what its file library does.
-            self._sweep()
+            if processes.has_lost(error):
+                raise
+            if processes.is_first():
+                self._sweep()
             raise NotSaved(self._not_saved(chunk, error)) from None
-        self._prune()
+        if processes.is_first():
+            self._prune()
 
     def restore(self, runner_shapes: RunnerState) -> tuple[RunnerState, Manifest]:
         """Load the newest sound checkpoint into a state of the given shapes (arrays or structs).
@@ -116,21 +131,29 @@ class Checkpoints:
             ValueError: there is no checkpoint, or none that is sound.
             Mismatch: it is of another run.
         """
+        with processes.together():
+            found = self._newest_sound() if processes.is_first() else None
+        chunk, faults = processes.gather(found)[0]
+        description = manifest.read(self._place(chunk), chunk, ())
+        items = _split(runner_shapes)
+        if not description.is_exact:
+            items.pop("memory", None)
+        restored = self._restored(chunk, description, items)
+        for damaged, fault in faults if processes.is_first() else ():
+            warnings.warn(f"{fault}; going on from chunk {chunk}", UserWarning, stacklevel=2)
+            self._set_aside(damaged)
+        return _join(restored), description
+
+    def _newest_sound(self) -> tuple[int, list[tuple[int, str]]]:
+        """The newest checkpoint that is what was written, and what is wrong with newer ones."""
         faults = []
         for chunk in reversed(self._require_some()):
             try:
-                description = manifest.read(self._place(chunk), chunk)
+                manifest.read(self._place(chunk), chunk)
             except Damaged as error:
                 faults.append((chunk, f"checkpoint {self._place(chunk)}: damaged, {error}"))
-                continue
-            items = _split(runner_shapes)
-            if not description.is_exact:
-                items.pop("memory", None)
-            restored = self._restored(chunk, description, items)
-            for damaged, fault in faults:
-                warnings.warn(f"{fault}; going on from chunk {chunk}", UserWarning, stacklevel=2)
-                self._set_aside(damaged)
-            return _join(restored), description
+            else:
+                return chunk, faults
         raise ValueError("; ".join(fault for _, fault in faults))
 
     def restore_policy(
@@ -298,7 +321,7 @@ def _split(runner: RunnerState) -> dict[str, Any]:
 
 
 def _placed(shapes: Any) -> Any:
-    first = SingleDeviceSharding(jax.devices()[0])
+    first = SingleDeviceSharding(jax.local_devices()[0])
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(
             x.shape, x.dtype, sharding=getattr(x, "sharding", None) or first
@@ -309,7 +332,8 @@ def _placed(shapes: Any) -> Any:
 
 def _key_data(key: Any) -> Any:
     if isinstance(key, jax.ShapeDtypeStruct):
-        return jax.eval_shape(jax.random.key_data, key)
+        data = jax.eval_shape(jax.random.key_data, key)
+        return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=key.sharding)
     return jax.random.key_data(key)
 
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sqn_jax.outside.messages import say
-from sqn_jax.outside.reading import open_regular
+from sqn_jax.outside.reading import open_regular, read_at_most
 
 NAME = ".lock"
 
@@ -46,6 +46,14 @@ def locked(run_dir: Path) -> Iterator[None]:
             _note(file, "")
     finally:
         os.close(file)
+
+
+def owner(run_dir: Path) -> str:
+    """What the process that trains in a folder has noted; "" where there is none."""
+    try:
+        return read_at_most(run_dir / NAME, 200, "a lock", follow=False).decode(errors="replace")
+    except (OSError, ValueError):
+        return ""
 
 
 def _take(file: int, run_dir: Path) -> None:

@@ -95,9 +95,14 @@ class Manifest:
         return leaves
 
 
+def describe_leaves(items: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Shape, dtype and SHA-256 of each array of some trees; all processes of a run call it."""
+    return {path: {**_form(leaf), "sha256": leaf_digest(leaf)} for path, leaf in leaves_of(items)}
+
+
 def write(
     folder: Path,
-    items: Mapping[str, Any],
+    leaves: Mapping[str, Mapping[str, Any]],
     origin: Origin,
     *,
     chunk: int,
@@ -108,7 +113,7 @@ def write(
 
     Args:
         folder: of the checkpoint.
-        items: the trees it holds, as arrays.
+        leaves: of `describe_leaves`.
         origin: the run.
         chunk: chunks done.
         score: success in training since the checkpoint before.
@@ -124,9 +129,7 @@ def write(
         "device": devices.describe(),
         "num_devices": origin.num_devices,
         "versions": versions(),
-        "leaves": {
-            path: {**_form(leaf), "sha256": leaf_digest(leaf)} for path, leaf in leaves_of(items)
-        },
+        "leaves": dict(leaves),
         "files": {
             path.relative_to(folder).as_posix(): _file_digest(path, flush=True)
             for path in _files(folder)
@@ -299,8 +302,8 @@ def leaves_of(items: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def leaf_digest(leaf: Any) -> str:
-    """SHA-256 of an array's bytes in row-major order."""
-    data = np.ascontiguousarray(np.asarray(leaf)).reshape(-1).view(np.uint8)
+    """SHA-256 of an array's bytes in row-major order, wherever its parts lie."""
+    data = np.ascontiguousarray(devices.on_host(leaf)).reshape(-1).view(np.uint8)
     return hashlib.sha256(data.data).hexdigest()
 
 

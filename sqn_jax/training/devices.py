@@ -1,8 +1,10 @@
-"""One run on several devices: each steps its shard of the robots and learns from it.
+"""One run on several devices: seeds are spread first, then the robots of each.
 
-Robots, minibatches and the replay's episodes are divided evenly; each device has all parameters,
-and gradients are averaged. What a robot does and which episodes are drawn does not depend on the
-number of devices: a seed gives the same run, to the rounding of sums.
+Devices with seeds of their own have nothing to wait for. Those that share seeds divide robots,
+minibatches and the replay's episodes evenly; each has all parameters of its seeds, and gradients
+are averaged. What a robot does and which episodes are drawn does not depend on the number of
+devices: a seed gives the same run, to the rounding of sums. It does not matter either which process
+the devices belong to (`processes.py`).
 
 The cores of a CPU count as devices of their own (`use_cores`). One XLA program on two cores splits
 every small loop between them and waits for both; two programs side by side wait for each other once
@@ -11,15 +13,18 @@ an update.
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from sqn_jax.agent.shards import AXIS
+from sqn_jax.agent.shards import AXIS, SEEDS
 from sqn_jax.config import TrainConfig
 from sqn_jax.outside.messages import say
 
@@ -100,6 +105,8 @@ def describe(mesh: Mesh | None = None) -> str:
     device = jax.devices()[0]
     kind = cpu_model() if device.platform == "cpu" else device.device_kind
     times = "" if mesh is None else f" x {mesh.size}"
+    if mesh is not None and (count := jax.process_count()) > 1:
+        times += f" in {count} processes"
     return f"{device.platform} ({kind}){times}"
 
 
@@ -120,35 +127,68 @@ def num_cores() -> int:
     return os.cpu_count() or 1
 
 
+def describe_division(mesh: Mesh | None, num_seeds: int) -> str:
+    """How a run with several seeds is divided between devices; "" for one of either."""
+    if mesh is None or num_seeds == 1:
+        return ""
+    groups, shards = mesh.shape[SEEDS], mesh.shape[AXIS]
+    seeds = f"{num_seeds} seeds spread over {groups}" if groups > 1 else f"all {num_seeds} seeds"
+    robots = f"robots of each over {shards}" if shards > 1 else "all robots of a seed on one"
+    return f" ({seeds}, {robots})"
+
+
 def choose(config: TrainConfig, wanted: int | None = None) -> Mesh | None:
-    """The devices for a run; None stands for one alone.
+    """The devices for a run, as many of each process; None stands for one alone.
 
     Args:
         config: the run.
         wanted: how many. By default as many cores of a CPU as leave each at least
-            `SMALLEST_SHARD` robots of a minibatch, and one accelerator.
+            `SMALLEST_SHARD` robots of a minibatch, or has a seed of its own; and one accelerator,
+            or all of several processes.
 
     Raises:
         ValueError: there are not as many, or the robots cannot be divided evenly.
     """
-    available = jax.devices()
+    most, processes = len(jax.devices()), jax.process_count()
     if wanted is None:
-        most = len(available) if available[0].platform == "cpu" else 1
-        worth = range(1, min(most, config.learner.batch_size // SMALLEST_SHARD) + 1)
-        count = max((n for n in worth if _divides(n, config)), default=1)
+        count = most
+        if jax.devices()[0].platform == "cpu":
+            worth = [n for n in range(processes, most + 1, processes) if _is_worth(n, config)]
+            count = max(worth, default=processes)
+        elif processes == 1:
+            count = 1
     else:
         count = wanted
-        _require(1 <= count <= len(available), count, f"1 to {len(available)} of this machine")
-        sizes = f"num_envs ({config.num_envs}) and learner.batch_size ({config.learner.batch_size})"
-        _require(_divides(count, config), count, f"a divisor of {sizes}")
-    return first_devices(count)
+    places = f"{processes} processes, as many of each" if processes > 1 else "this machine"
+    _require(
+        processes <= count <= most and count % processes == 0,
+        count,
+        f"{processes} to {most} of {places}",
+    )
+    sizes = f"num_envs ({config.num_envs}) and learner.batch_size ({config.learner.batch_size})"
+    several = f" times one of num_seeds ({config.num_seeds})" if config.num_seeds > 1 else ""
+    _require(_divides(count, config), count, f"a divisor of {sizes}{several}")
+    return first_devices(count, math.gcd(count, config.num_seeds))
 
 
-def first_devices(count: int) -> Mesh | None:
-    """The first devices that there are, at least `count`; None stands for one alone."""
+def first_devices(count: int, groups: int = 1) -> Mesh | None:
+    """The first devices of each process, `count` in all; None stands for one alone.
+
+    Args:
+        count: at most as many as there are, a multiple of the number of processes.
+        groups: into how many they are divided that have seeds of their own.
+    """
     if count == 1:
         return None
-    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=jax.devices()[:count])
+    of_each = count // jax.process_count()
+    chosen = [
+        device
+        for process in range(jax.process_count())
+        for device in jax.local_devices(process)[:of_each]
+    ]
+    # Not `jax.make_mesh`, which may order them otherwise: a group should lie in one process.
+    places = np.array(chosen).reshape(groups, count // groups)
+    return Mesh(places, (SEEDS, AXIS), axis_types=(AxisType.Auto, AxisType.Auto))
 
 
 def one_and_all() -> list[Mesh | None]:
@@ -157,7 +197,14 @@ def one_and_all() -> list[Mesh | None]:
 
 
 def _divides(count: int, config: TrainConfig) -> bool:
-    return config.num_envs % count == 0 and config.learner.batch_size % count == 0
+    shards = count // math.gcd(count, config.num_seeds)
+    return config.num_envs % shards == 0 and config.learner.batch_size % shards == 0
+
+
+def _is_worth(count: int, config: TrainConfig) -> bool:
+    shards = count // math.gcd(count, config.num_seeds)
+    is_large = config.learner.batch_size // shards >= SMALLEST_SHARD
+    return _divides(count, config) and (shards == 1 or is_large)
 
 
 def _require(condition: bool, value: int, expected: str) -> None:
@@ -169,11 +216,36 @@ def place(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
     """Arrays on the devices of a mesh.
 
     Args:
-        tree: arrays.
+        tree: arrays, the same in all processes.
         mesh: None leaves them where they are.
         specs: how they are divided, a tree or the beginning of one.
     """
-    return tree if mesh is None else jax.device_put(tree, _shardings(mesh, specs))
+    if mesh is None:
+        return tree
+    return jax.tree.map(put, tree, jax.tree.broadcast(_shardings(mesh, specs), tree))
+
+
+def put(array: Any, sharding: Any) -> jax.Array:
+    """An array that every process has, where a sharding wants it; each makes its own part."""
+    if sharding.is_fully_addressable:
+        return jax.device_put(array, sharding)
+    return jax.make_array_from_callback(array.shape, sharding, lambda part: array[part])
+
+
+def own_part(array: Any) -> Any:
+    """What one device of this process has of an array, on the host."""
+    return np.asarray(array.addressable_data(0) if isinstance(array, jax.Array) else array)
+
+
+def on_host(tree: Any) -> Any:
+    """Arrays as NumPy has them, whole in every process; all processes are to call it."""
+    return jax.tree.map(_whole, tree)
+
+
+def _whole(array: Any) -> Any:
+    if not isinstance(array, jax.Array) or array.is_fully_addressable or array.is_fully_replicated:
+        return np.asarray(array)
+    return multihost_utils.process_allgather(array, tiled=True)
 
 
 def placed_shapes(shapes: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:

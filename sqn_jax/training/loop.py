@@ -3,9 +3,9 @@
 `train_chunk` is the device program; `run` calls it chunk by chunk and hands numbers to the host
 in between. Files, bars and pictures stand outside, in whoever consumes the generator.
 
-With a mesh of several devices (`devices.choose`) each of them steps and learns from its shard of
-the robots. Random numbers are drawn for all robots alike on each, so that no robot's fate depends
-on the number of devices.
+With a mesh of several devices (`devices.choose`) each of them has some of the seeds; those that
+have the same seeds step and learn from a shard of the robots each. Random numbers are drawn for all
+robots alike on each, so that no robot's fate depends on the number of devices.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from sqn_jax.agent import pqn, r2d2
 from sqn_jax.agent.exploration import epsilon_per_robot, epsilon_schedule
 from sqn_jax.agent.learner import LearnerState, current_discount, progress
 from sqn_jax.agent.program import Program
-from sqn_jax.agent.shards import mean, own_shard
+from sqn_jax.agent.shards import all_shards, mean, own_shard
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.training.curriculum import by_learnability, with_outcomes
-from sqn_jax.training.devices import place, placed_shapes
+from sqn_jax.training.devices import own_part, place, placed_shapes
 from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
@@ -190,7 +190,19 @@ def _train_chunk_on_each(
     def rounds(runner: RunnerState) -> tuple[RunnerState, Metrics]:
         return jax.lax.scan(one_round, runner, None, length=program.config.rounds_per_chunk)
 
-    return rounds(runner) if program.config.num_seeds == 1 else jax.vmap(rounds)(runner)
+    if program.config.num_seeds == 1:
+        return rounds(runner)
+    runner, metrics = _for_each_seed(rounds, runner)
+    gather = partial(all_shards, axis_name=program.seed_axis_name)
+    return runner, jax.tree.map(gather, metrics)
+
+
+def _for_each_seed(function: Callable[..., Any], runner: RunnerState) -> Any:
+    """Side by side; one alone as a run of one seed, whose branches can be left out."""
+    if runner.key.shape[0] > 1:
+        return jax.vmap(function)(runner)
+    results = function(jax.tree.map(lambda x: x[0], runner))
+    return jax.tree.map(lambda x: x[None], results)
 
 
 _jitted_train_chunk = jax.jit(train_chunk, static_argnames="program", donate_argnames="runner")
@@ -275,7 +287,7 @@ def run(
 
 def rounds_done(runner: RunnerState) -> int:
     """Rounds that lie behind a state, as a number on the host."""
-    return int(np.max(np.asarray(runner.learner.round)))
+    return int(np.max(own_part(runner.learner.round)))
 
 
 def _average(metrics: dict[str, Any], config: TrainConfig) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def compiled_bytes(compiled: Any) -> float:
 
 def available_bytes() -> float | None:
     """Bytes that can still be allocated where a run would be; None if unknown."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         if "bytes_limit" not in stats:

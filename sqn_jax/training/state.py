@@ -134,11 +134,15 @@ def memory_bytes(program: Program) -> int:
 
 
 def runner_specs(program: Program) -> RunnerState:
-    """How the arrays of a state are divided between devices: only what the replay stores is."""
-    each: Any = REPLICATED
+    """How the arrays of a state are divided between devices.
+
+    All of them by seeds, where there are groups of devices for these, and what the replay stores
+    by robots.
+    """
+    seeds = () if program.config.num_seeds == 1 else (program.seed_axis_name,)
+    each: Any = REPLICATED if program.seed_axis_name is None else PartitionSpec(*seeds)
     memory: Any = None
     if program.config.method == "r2d2":
-        seeds = () if program.config.num_seeds == 1 else (None,)
         stored: Any = PartitionSpec(*seeds, None, AXIS)
         memory = ReplayState(stored, each, each, each, each)
     learner = LearnerState(

@@ -31,7 +31,11 @@ def leaves(cls: type = TrainConfig, prefix: str = "") -> Iterator[tuple[str, Any
 
 
 LEAVES = dict(leaves())
-OWN = ["--help", "--preset", "--run-dir", "--resume", "--device", "--num-devices", "--tensorboard"]
+OWN = [
+    *("--help", "--preset", "--run-dir", "--resume", "--device", "--num-devices"),
+    *("--distributed", "--coordinator", "--num-processes", "--process-id", "--process-timeout"),
+    "--tensorboard",
+]
 
 
 @pytest.fixture

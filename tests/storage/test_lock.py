@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sqn_jax.storage.lock import NAME, locked
+from sqn_jax.storage.lock import NAME, locked, owner
 
 HOLD = """
 import sys, time
@@ -52,6 +52,15 @@ def test_the_lock_of_a_killed_process_keeps_nobody_off(
         assert f"process {os.getpid()} " in (tmp_path / NAME).read_text()
     with locked(tmp_path):
         assert capsys.readouterr().err == ""
+
+
+def test_others_that_share_the_folder_see_who_has_it(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    assert owner(run_dir) == ""
+    with locked(run_dir):
+        assert owner(run_dir).startswith(f"process {os.getpid()} on ")
+        assert owner(tmp_path) == ""
+    assert owner(run_dir) == ""
 
 
 def test_however_the_block_ends_the_folder_is_free_again(tmp_path: Path) -> None:

@@ -116,18 +116,21 @@ def test_items_are_fetched_from_whichever_device_holds_them(mesh: Mesh, dtype: A
     ],
 )
 def test_two_devices_make_the_run_that_one_makes(
-    mesh: Mesh, world: EnvParams, method: Any, num_seeds: int
+    world: EnvParams, method: Any, num_seeds: int
 ) -> None:
     """To the rounding of sums: the same tasks, actions, noise and drawn episodes."""
     config = config_for(method, num_seeds=num_seeds)
     found = []
-    for chosen in (None, mesh):
+    for chosen in (None, devices.choose(config, 2)):
         program = make_program(world, config, chosen)
         runner = loop.start_run(program)
         *_, (runner, last) = loop.run(runner, world, program)
         found.append((runner, last.metrics))
     (one, told_by_one), (two, told_by_two) = found
     assert len(jax.tree.leaves(two.learner.params)[0].sharding.device_set) == 2
+    expected = {"seeds": num_seeds, "devices": 2 // num_seeds}
+    sharding = jax.tree.leaves(two.learner.params)[0].sharding
+    assert dict(sharding.mesh.shape) == expected
     assert told_by_one.keys() == told_by_two.keys()
     for name, value in told_by_one.items():
         assert np.isfinite(value).all(), name
@@ -181,6 +184,28 @@ def test_a_device_gets_at_least_eight_robots_of_a_minibatch() -> None:
     assert chosen_count(17, 17) == 1  # Two cannot share 17 robots evenly.
     assert chosen_count(256, 16, wanted=1) == 1
     assert chosen_count(16, 8, wanted=2) == 2
+
+
+@pytest.mark.parametrize(
+    ("num_seeds", "sizes", "division", "words"),
+    [
+        (1, (16, 16), (1, 2), ""),
+        (2, (16, 16), (2, 1), " (2 seeds spread over 2, all robots of a seed on one)"),
+        (6, (16, 16), (2, 1), " (6 seeds spread over 2, all robots of a seed on one)"),
+        (3, (16, 16), (1, 2), " (all 3 seeds, robots of each over 2)"),
+        (2, (3, 1), (2, 1), " (2 seeds spread over 2, all robots of a seed on one)"),
+    ],
+)
+def test_seeds_are_spread_first_and_robots_second(
+    num_seeds: int, sizes: tuple[int, int], division: tuple[int, int], words: str
+) -> None:
+    """A seed of its own is always worth a device, however few robots there are."""
+    learner = LearnerConfig(batch_size=sizes[1])
+    config = TrainConfig(method="pqn", num_envs=sizes[0], learner=learner, num_seeds=num_seeds)
+    mesh = devices.choose(config)
+    assert mesh is not None
+    assert (mesh.shape["seeds"], mesh.shape["devices"]) == division
+    assert devices.describe_division(mesh, num_seeds) == words
 
 
 @pytest.mark.parametrize(
