@@ -1,0 +1,18 @@
+"""One small room for all adapters, so that they share their compiled programs."""
+
+from __future__ import annotations
+
+import pytest
+from rooms import small_room_map
+
+from sqn_jax.maps import OccupancyMap
+
+LENGTH = 6
+"""Steps of an episode."""
+
+NOISE = {"velocity_noise": 0.1, "range_noise": 0.1}
+
+
+@pytest.fixture(scope="session")
+def room() -> OccupancyMap:
+    return small_room_map(LENGTH)
