@@ -36,7 +36,7 @@ class NavigationEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     `info`: see `sqn_jax.step`; empty after a reset.
 
     A reset with a seed starts the sequence of episodes that belongs to it, one without goes on
-    with the next. The episodes of a seed are those of the vector environment's env of that seed.
+    with the next. The vector environment has the same episodes, but for rounding.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012

@@ -42,7 +42,8 @@ Result = tuple[Any, Any, Any, Any, Infos]
 class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """N robots of one world; see `gym.NavigationEnv` for spaces, end, seeds and info.
 
-    The episodes of env i after `reset(seed=s)` are those of a `NavigationEnv` with seed s + i.
+    The episodes of env i after `reset(seed=s)` are those of a `NavigationEnv` with seed s + i, but
+    for rounding.
     A reset without a seed goes on with the next episode of each env.
 
     Autoreset: NEXT_STEP begins the next episode in the step after the last; its reward is 0.
@@ -107,9 +108,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             "autoreset_mode": self.autoreset_mode,
             "render_fps": render_fps(self.env_params),
         }
-        self._episodes: programs.EpisodeState | None = None
-        self._obs: Array
-        self._is_over: Array | NDArray[np.bool_]
+        self._before: tuple[Array, programs.EpisodeState] | None = None
+        """Observations [N, R + G] and states [N] before the next step, on the device."""
+        self._is_over: Array | NDArray[np.bool_] = np.zeros(num_envs, bool)
         self._renderer: Renderer | None = None
 
     def reset(  # type: ignore[override]
@@ -129,19 +130,15 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         keys = self._keys(seed)
         if "reset_mask" in (options or {}):
             assert options is not None
-            selected = self._mask(options["reset_mask"])
-            episodes = self._begun()
-            keys = programs.select_envs(selected, keys, episodes.next_key)
-            episodes = dataclasses.replace(episodes, next_key=keys)
-            before = self._is_over
-            self._obs, self._episodes = programs.restart_selected(
-                selected, self._obs, episodes, self.env_params
-            )
-            self._is_over = before & ~selected
+            selected, (obs, episodes) = self._mask(options["reset_mask"]), self._begun()
         else:
-            self._obs, self._episodes = programs.begin_many(keys, self.env_params)
-            self._is_over = np.zeros(self.num_envs, bool)
-        return self._own(self._obs), {}
+            selected = np.ones(self.num_envs, bool)
+            obs, episodes = self._before or programs.blank(keys, self.env_params)
+        keys = programs.select_envs(selected, keys, episodes.next_key)
+        episodes = dataclasses.replace(episodes, next_key=keys)
+        self._before = programs.restart_selected(selected, obs, episodes, self.env_params)
+        self._is_over = self._is_over & ~selected
+        return self._own(self._before[0]), {}
 
     def step(self, actions: Any) -> Result:
         """Advance all envs by one time step.
@@ -155,27 +152,26 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             gymnasium.error.ResetNeeded: no episode has begun; or, with autoreset DISABLED, one is
                 over.
         """
-        episodes, actions = self._begun(), self._checked(actions)
-        was_over = self._is_over
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            self._episodes, step, final_obs = programs.step_then_restart(
-                episodes, actions, self.env_params
-            )
-            self._obs = step.obs
-            return self._same_step(step, final_obs)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            self._episodes, step = programs.restart_or_step(
-                was_over, episodes, actions, self.env_params
-            )
-        elif np.asarray(was_over).any():
+        _, episodes = self._begun()
+        mode, was_over = self.autoreset_mode, self._is_over
+        if mode is AutoresetMode.DISABLED and np.asarray(was_over).any():
             raise error.ResetNeeded(
                 "an episode is over, expected reset with the option reset_mask before step"
             )
-        else:
-            self._episodes, step = programs.advance_many(episodes, actions, self.env_params)
-        self._obs, self._is_over = step.obs, step.terminated | step.truncated
-        *results, info, was_over = self._own((*step, was_over))
-        return (*results, _masked(info, ~was_over))  # type: ignore[return-value]
+        episodes, step = programs.advance_many(episodes, self._checked(actions), self.env_params)
+        self._before = step.obs, episodes
+        obs, reward, terminated, truncated, info = self._own(step)
+        is_over = terminated | truncated
+        if mode is AutoresetMode.SAME_STEP:
+            infos = self._infos_of_both(info, obs, is_over)
+            return self._restarted(is_over, obs), reward, terminated, truncated, infos
+        self._is_over = is_over
+        if mode is AutoresetMode.NEXT_STEP:
+            obs = self._restarted(was_over, obs)
+            reward = reward * ~was_over
+            terminated, truncated = terminated & ~was_over, truncated & ~was_over
+            self._is_over = is_over & ~was_over
+        return obs, reward, terminated, truncated, _masked(info, ~was_over)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
         """A picture [h, w, 3] of each env."""
@@ -183,36 +179,43 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             return None
         if self._renderer is None:
             self._renderer = Renderer(self.occupancy_map, self.env_params)
-        states, observations = jax.device_get((self._begun().env_state, self._obs))
+        obs, episodes = self._begun()
+        states, observations = jax.device_get((episodes.env_state, obs))
         return tuple(
             self._renderer.draw(jax.tree.map(lambda x, i=i: x[i], states), observations[i])
             for i in range(self.num_envs)
         )
 
-    def _same_step(self, step: programs.Step, final_obs: Array) -> Result:
-        obs, reward, terminated, truncated, info, final_obs = self._own((*step, final_obs))
-        is_over = terminated | truncated
-        infos = _masked(info, ~is_over)
-        if self.arrays == "jax" or is_over.any():
-            if self.arrays == "numpy":  # As Gymnasium has it: an observation, or None.
-                infos["final_obs"] = np.full(self.num_envs, None, object)
-                for index in np.flatnonzero(is_over):
-                    infos["final_obs"][index] = final_obs[index]
-            else:
-                infos["final_obs"] = final_obs
-            infos["_final_obs"] = is_over
-            infos["final_info"], infos["_final_info"] = _masked(info, is_over), is_over
-        return obs, reward, terminated, truncated, infos
+    def _restarted(self, selected: Any, obs: Any) -> Any:
+        """Observations [N, R + G] once the next episode has begun in some envs [N]."""
+        if self.arrays == "numpy" and not selected.any():
+            return obs
+        self._before = programs.restart_selected(selected, *self._begun(), self.env_params)
+        return self._own(self._before[0])
 
-    def _begun(self) -> programs.EpisodeState:
-        if self._episodes is None:
+    def _infos_of_both(self, info: Infos, obs: Any, is_over: Any) -> Infos:
+        """Infos where a step can be the last of one episode and the first of the next."""
+        infos = _masked(info, ~is_over)
+        if self.arrays == "jax":
+            infos["final_obs"] = obs
+        elif is_over.any():  # As Gymnasium has it: an observation, or None.
+            infos["final_obs"] = np.full(self.num_envs, None, object)
+            for index in np.flatnonzero(is_over):
+                infos["final_obs"][index] = obs[index]
+        else:
+            return infos
+        final = {"_final_obs": is_over, "_final_info": is_over}
+        return infos | final | {"final_info": _masked(info, is_over)}
+
+    def _begun(self) -> tuple[Array, programs.EpisodeState]:
+        if self._before is None:
             raise error.ResetNeeded("no episode has begun, expected reset before")
-        return self._episodes
+        return self._before
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> Array:
         """The keys [N] of the episodes that begin next; those of envs with a seed are its own."""
-        if seed is None and self._episodes is not None:
-            return self._episodes.next_key
+        if seed is None and self._before is not None:
+            return self._before[1].next_key
         if seed is None:
             return programs.make_keys(draw_key_numbers(self.np_random, self.num_envs))
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed)
@@ -221,9 +224,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         is_seeded = np.array([each is not None for each in seeds])
         numbers = [draw_key_numbers(seeding.np_random(each)[0]) for each in seeds]
         keys = programs.make_keys(np.stack(numbers))
-        if self._episodes is None or is_seeded.all():
+        if self._before is None or is_seeded.all():
             return keys
-        return programs.select_envs(is_seeded, keys, self._episodes.next_key)
+        return programs.select_envs(is_seeded, keys, self._before[1].next_key)
 
     def _mask(self, mask: Any) -> NDArray[np.bool_]:
         is_mask = isinstance(mask, np.ndarray) and mask.dtype == bool

@@ -22,7 +22,7 @@ from jax.typing import DTypeLike
 
 from sqn_jax.adapters import programs
 from sqn_jax.adapters.options import Spawn, make_world, observation_size
-from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, navigation
+from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState
 from sqn_jax.maps import OccupancyMap
 
 Info = dict[str, Array]
@@ -60,7 +60,8 @@ class Box:
 
     def contains(self, x: Any) -> Array:
         """bool: whether an array is one of them."""
-        return jnp.all((jnp.asarray(x) >= self.low) & (jnp.asarray(x) <= self.high))
+        low, high = jnp.asarray(self.low, self.dtype), jnp.asarray(self.high, self.dtype)
+        return jnp.all((jnp.asarray(x) >= low) & (jnp.asarray(x) <= high))
 
 
 @dataclass(frozen=True)
@@ -132,14 +133,6 @@ class Navigation:
         step_results = programs.step_once(key, state, action, params)
         obs, state, reward, terminated, _, info = step_results
         return obs, state, reward, terminated, info
-
-    def observe(
-        self, key: Array, state: EnvState, action: Any, params: EnvParams | None = None
-    ) -> Array:
-        """The observation of a state, whichever action led to it; the key is for noise."""
-        params = self._or_default(params)
-        ranges = navigation.true_ranges(state.pose, params)
-        return programs.flat(navigation.observe(key, ranges, state, params))
 
     def is_truncated(self, state: EnvState, params: EnvParams | None = None) -> Array:
         """bool: whether the time limit is reached."""

@@ -103,33 +103,13 @@ def select_envs(selected: Array | NDArray[np.bool_], new: Any, old: Any) -> Any:
     return jax.tree.map(select, new, old)
 
 
-def _advance_many(
-    episodes: EpisodeState, actions: Array, env_params: EnvParams
-) -> tuple[EpisodeState, Step]:
-    return jax.vmap(advance, in_axes=(0, 0, None))(episodes, actions, env_params)
-
-
-def _step_then_restart(
-    episodes: EpisodeState, actions: Array, env_params: EnvParams
-) -> tuple[EpisodeState, Step, Array]:
-    episodes, step = _advance_many(episodes, actions, env_params)
-    obs, episodes = restart(step.terminated | step.truncated, step.obs, episodes, env_params)
-    return episodes, step._replace(obs=obs), step.obs
-
-
-def _restart_or_step(
-    is_over: Array, episodes: EpisodeState, actions: Array, env_params: EnvParams
-) -> tuple[EpisodeState, Step]:
-    episodes, step = _advance_many(episodes, actions, env_params)
-    obs, episodes = restart(is_over, step.obs, episodes, env_params)
-    step = Step(
-        obs=obs,
-        reward=jnp.where(is_over, 0.0, step.reward),
-        terminated=step.terminated & ~is_over,
-        truncated=step.truncated & ~is_over,
-        info=step.info,
+def blank(keys: Array, env_params: EnvParams) -> tuple[Array, EpisodeState]:
+    """Observations [N, R + G] and states [N] of envs before their first episodes, of keys [N]."""
+    shapes = jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), keys, env_params)
+    obs, env_states = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), (shapes[0], shapes[1].env_state)
     )
-    return episodes, step
+    return obs, EpisodeState(env_states, noise_key=keys, next_key=keys)
 
 
 def _reset(key: Array, env_params: EnvParams) -> tuple[Array, EnvState]:
@@ -144,8 +124,9 @@ def _step(key: Array, state: EnvState, action: Any, env_params: EnvParams) -> Gy
 
 def _step_and_reset(key: Array, state: EnvState, action: Any, env_params: EnvParams) -> GymnaxStep:
     step_key, reset_key = jax.random.split(key)
-    final_obs, state, reward, terminated, truncated, info = _step(
-        step_key, state, action, env_params
+    # Else XLA would fuse the step with what follows, and round otherwise than without a reset.
+    final_obs, state, reward, terminated, truncated, info = jax.lax.optimization_barrier(
+        _step(step_key, state, action, env_params)
     )
     obs, state = _reset_where(terminated | truncated, reset_key, (final_obs, state), env_params)
     info |= {"terminated": terminated, "truncated": truncated, "final_observation": final_obs}
@@ -190,17 +171,9 @@ def _reset_where(
 
 begin_one = jax.jit(begin)
 advance_one = jax.jit(advance)
-
-begin_many = jax.jit(jax.vmap(begin, in_axes=(0, None)))
-"""keys [N] to observations [N, R + G] and states [N]."""
-restart_selected = jax.jit(restart)
-advance_many = jax.jit(_advance_many)
+advance_many = jax.jit(jax.vmap(advance, in_axes=(0, 0, None)))
 """A step of N envs without a reset."""
-step_then_restart = jax.jit(_step_then_restart)
-"""A step of N envs; those whose episode ends begin the next at once. Also returns the observations
-[N, R + G] before that."""
-restart_or_step = jax.jit(_restart_or_step)
-"""A step of N envs in which those whose episode was over [N] begin the next instead."""
+restart_selected = jax.jit(restart)
 
 reset_once = jax.jit(_reset)
 """A key to an observation [R + G] and a state."""

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import jax
 import pytest
 from rooms import small_room_map
 
+import sqn_jax
 from sqn_jax.maps import OccupancyMap
 
 LENGTH = 6
 """Steps of an episode."""
+
+take = jax.jit(sqn_jax.step)
+begin = jax.jit(sqn_jax.reset)
 
 NOISE = {"velocity_noise": 0.1, "range_noise": 0.1}
 
