@@ -1,6 +1,6 @@
 """Train PPO in the simulator, all of it in one compiled program: the shape of PureJaxRL.
 
-python examples/purejaxrl_ppo.py --map column --steps 1228800 --out curve.json
+python examples/purejaxrl_ppo.py --out curve.json
 
 The environment has the interface of gymnax 1.x (`sqn_jax.adapters.gymnax`); the loop is one to
 start from for an algorithm of one's own. The network has no memory. The greedy policy is evaluated
@@ -25,6 +25,9 @@ from flax.training.train_state import TrainState
 from jax import Array
 
 from sqn_jax.adapters.gymnax import Navigation
+
+FOUR_ROOMS = f"{Path(__file__).with_name('four_rooms.map')}@0.25"
+"""A map of 6 x 6 m, and its scale in m a cell."""
 
 DISCOUNT, TRACE_DECAY, CLIP, ENTROPY, VALUE = 0.99, 0.95, 0.2, 0.01, 0.5
 EPOCHS, MINIBATCHES, LEARNING_RATE = 4, 8, 1e-3
@@ -118,9 +121,8 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
     Raises:
         ValueError: the map is unusable.
     """
-    settings = {} if options.max_steps is None else {"max_steps": options.max_steps}
-    env = Navigation(options.map, **settings)
-    tests = Navigation(options.map, spawn="evaluation", **settings)
+    env = Navigation(options.map, max_steps=options.max_steps)
+    tests = Navigation(options.map, spawn="evaluation", max_steps=options.max_steps)
     network = ActorCritic(env.num_actions)
     over_envs = (0, 0, 0, None)
     num_updates = options.steps // (options.num_envs * options.rollout_steps)
@@ -197,8 +199,8 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
 def main() -> None:
     """Parse the arguments, train, write the curve."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--map", default="column", help="as for sqn train (default column)")
-    parser.add_argument("--max-steps", type=int, help="of an episode (default the map's)")
+    parser.add_argument("--map", default=FOUR_ROOMS, help="as for sqn train")
+    parser.add_argument("--max-steps", type=int, default=200, help="of an episode")
     parser.add_argument("--steps", type=int, default=1_228_800, help="of all envs together")
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--rollout-steps", type=int, default=64, help="steps between updates")
@@ -216,11 +218,10 @@ def main() -> None:
     started = time.perf_counter()
     successes, rewards = jax.device_get(compiled(key))
     seconds = time.perf_counter() - started
-    max_steps = Navigation(options.map).default_params.max_steps
     rows = []
     for point, (success, reward) in enumerate(zip(successes, rewards, strict=True)):
         steps = options.steps * point // options.eval_points
-        row = {"episodes": steps / (options.max_steps or max_steps), "env_steps": steps}
+        row = {"episodes": steps / options.max_steps, "env_steps": steps}
         rows.append(row | {"eval_success": float(success), "eval_mean_reward": float(reward)})
         print(f"{steps:>9,} steps  success {success:.2f}  reward {reward:.3f}")
     print(f"{seconds:.1f} s")

@@ -1,6 +1,6 @@
 """Train sb3-contrib's RecurrentPPO in the simulator: somebody else's learner, unchanged.
 
-python examples/sb3_recurrent_ppo.py --map column --steps 1228800 --out curve.json
+python examples/sb3_recurrent_ppo.py --out curve.json
 
 Needs the extra `sb3`. As the training goes on, the greedy policy is evaluated from the evaluation
 points of the map, in the same tasks every time; the curve is printed, and written to `--out`.
@@ -13,7 +13,6 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,6 +25,9 @@ except ImportError as missing:
     raise SystemExit(2) from None
 
 from sqn_jax.adapters.sb3 import NavigationVecEnv
+
+FOUR_ROOMS = f"{Path(__file__).with_name('four_rooms.map')}@0.25"
+"""A map of 6 x 6 m, and its scale in m a cell."""
 
 NETWORK = {
     "lstm_hidden_size": 128,
@@ -79,7 +81,7 @@ class Curve(BaseCallback):
         wall_seconds = begun - self.started - self.seconds_evaluating
         self.seconds_evaluating += time.perf_counter() - begun
         steps = self.num_timesteps
-        episodes = steps / self.envs.envs.env_params.max_steps
+        episodes = steps / self.envs.get_attr("env_params")[0].max_steps
         row |= {"episodes": episodes, "env_steps": steps, "wall_seconds": round(wall_seconds, 1)}
         self.rows.append(row)
         print(
@@ -92,9 +94,9 @@ class Curve(BaseCallback):
 def train(options: argparse.Namespace) -> list[dict[str, float]]:
     """Train; returns the points of the curve."""
     torch.set_num_threads(options.threads)
-    settings: dict[str, Any] = {} if options.max_steps is None else {"max_steps": options.max_steps}
-    envs = NavigationVecEnv(options.map, options.num_envs, **settings)
-    tests = NavigationVecEnv(options.map, options.eval_episodes, spawn="evaluation", **settings)
+    limit = {"max_steps": options.max_steps}
+    envs = NavigationVecEnv(options.map, options.num_envs, **limit)
+    tests = NavigationVecEnv(options.map, options.eval_episodes, spawn="evaluation", **limit)
     curve = Curve(tests, options.eval_every)
     model = RecurrentPPO(
         "MlpLstmPolicy",
@@ -117,8 +119,8 @@ def train(options: argparse.Namespace) -> list[dict[str, float]]:
 def main() -> None:
     """Parse the arguments, train, write the curve."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--map", default="column", help="as for sqn train (default column)")
-    parser.add_argument("--max-steps", type=int, help="of an episode (default the map's)")
+    parser.add_argument("--map", default=FOUR_ROOMS, help="as for sqn train")
+    parser.add_argument("--max-steps", type=int, default=200, help="of an episode")
     parser.add_argument("--steps", type=int, default=1_228_800, help="of all envs together")
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--rollout-steps", type=int, default=128, help="steps between updates")

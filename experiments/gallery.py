@@ -107,9 +107,9 @@ def foreign_trainers() -> Any:
     curves = {
         "RecurrentPPO of sb3-contrib": [recorded("sb3_recurrent_ppo.json")["curve"]],
         "PPO without memory": [recorded("purejaxrl_ppo.json")["curve"]],
-        "SQN, preset quick": [recorded("column_short_runs.json")["runs"][0]["eval_curve"]],
+        "SQN, preset quick": [recorded("four_rooms_runs.json")["runs"][0]["eval_curve"]],
     }
-    return figures.learning_curves(curves, title="Column, greedy episodes")
+    return figures.learning_curves(curves, title="Four rooms of 6 x 6 m in all, greedy episodes")
 
 
 def robustness() -> Any:

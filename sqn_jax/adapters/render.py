@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,10 @@ SCAN, ROBOT, GOAL, INK = (86, 180, 233), (230, 159, 0), (255, 217, 47), (34, 34,
 
 ROBOT_PX = 9
 """Least length of the robot's arrowhead from its center, pixels."""
+
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+"""Variables of the environment by which SDL finds one on Linux."""
 
 
 class Renderer:
@@ -108,6 +113,11 @@ class Window:
             raise ImportError(
                 'render_mode is "human", which needs pygame: pip install pygame-ce'
             ) from None
+        # Without a display SDL would draw where nobody sees it.
+        if sys.platform == "linux" and not any(map(os.environ.get, DISPLAYS)):
+            raise RuntimeError(
+                f'render_mode is "human", expected a display: one of {", ".join(DISPLAYS)} is set'
+            )
         self._pygame = pygame
         self._frames_per_second = frames_per_second
         try:
@@ -116,9 +126,6 @@ class Window:
             raise RuntimeError(
                 f'render_mode is "human", expected a display; pygame says: {fault}'
             ) from None
-        # Without a display SDL draws where nobody sees it, unless it was asked for another driver.
-        if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
-            raise RuntimeError('render_mode is "human", expected a display; there is none')
         self._screen: Any = None
         self._clock = pygame.time.Clock()
 

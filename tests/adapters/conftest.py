@@ -1,21 +1,12 @@
-"""One small room for all adapters, so that they share their compiled programs."""
+"""The room that all adapters are tested in."""
 
 from __future__ import annotations
 
-import jax
 import pytest
+from one_room import LENGTH
 from rooms import small_room_map
 
-import sqn_jax
 from sqn_jax.maps import OccupancyMap
-
-LENGTH = 6
-"""Steps of an episode."""
-
-take = jax.jit(sqn_jax.step)
-begin = jax.jit(sqn_jax.reset)
-
-NOISE = {"velocity_noise": 0.1, "range_noise": 0.1}
 
 
 @pytest.fixture(scope="session")

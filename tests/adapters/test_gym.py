@@ -10,8 +10,8 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from conftest import LENGTH, NOISE, take
 from gymnasium.utils.env_checker import check_env
+from one_room import LENGTH, NOISE, take
 from refusals import refusal
 
 from sqn_jax.adapters.gym import NavigationEnv
@@ -26,7 +26,6 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     window = SimpleNamespace(blit=lambda surface, _: shown.append(surface))
     display = SimpleNamespace(
         init=lambda: None,
-        get_driver=lambda: "x11",
         set_caption=lambda _: None,
         set_mode=lambda size: window,
         flip=lambda: None,
@@ -40,6 +39,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         surfarray=SimpleNamespace(make_surface=lambda picture: picture),
     )
     monkeypatch.setitem(sys.modules, "pygame", pygame)
+    monkeypatch.setenv("DISPLAY", ":0")
     return shown
 
 
@@ -180,15 +180,17 @@ def test_a_window_shows_every_state(room: OccupancyMap, screen: list[Any]) -> No
     env.close()
 
 
-@pytest.mark.parametrize("driver", [None, "offscreen"])
+@pytest.mark.usefixtures("screen")
+@pytest.mark.parametrize("missing", ["pygame", "display"])
 def test_a_window_that_nobody_sees_is_refused(
-    room: OccupancyMap, driver: str | None, screen: list[Any], monkeypatch: pytest.MonkeyPatch
+    room: OccupancyMap, missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
-    if driver is None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    if missing == "pygame":
         monkeypatch.setitem(sys.modules, "pygame", None)
     else:
-        monkeypatch.setattr(sys.modules["pygame"].display, "get_driver", lambda: driver)
+        for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+            monkeypatch.delenv(name, raising=False)
     with pytest.raises((ImportError, RuntimeError), match='render_mode is "human", ') as caught:
         NavigationEnv(room, render_mode="human")
     assert "\n" not in str(caught.value)

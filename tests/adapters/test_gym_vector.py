@@ -8,9 +8,9 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from conftest import LENGTH, NOISE
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from one_room import LENGTH, NOISE
 from refusals import refusal
 
 import sqn_jax

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LENGTH, NOISE, begin, take
+from one_room import LENGTH, NOISE, begin, take
 from refusals import refusal
 
 from sqn_jax.adapters.gymnax import Box, Discrete, LegacyNavigation, Navigation

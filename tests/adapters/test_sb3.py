@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import LENGTH, NOISE
+from one_room import LENGTH, NOISE
 from refusals import refusal
 
 pytest.importorskip("stable_baselines3", reason="needs the extra sb3, which is not part of dev")

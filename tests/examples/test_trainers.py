@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from compiling import compiling_quickly
-from rooms import write_empty_room
 
 SMALL = ["--max-steps", "8", "--num-envs", "4", "--rollout-steps", "8", "--eval-episodes", "2"]
 
@@ -24,7 +23,7 @@ def run(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_trainer_writes_its_curve(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = [*SMALL, "--map", str(write_empty_room(tmp_path)), "--steps", "128"]
+    arguments = [*SMALL, "--steps", "128"]
     if name == "sb3_recurrent_ppo":
         pytest.importorskip("sb3_contrib", reason="needs the extra sb3, which is not part of dev")
         arguments += ["--eval-every", "2"]
