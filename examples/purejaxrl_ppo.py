@@ -3,8 +3,9 @@
 python examples/purejaxrl_ppo.py --out curve.json
 
 The environment has the interface of gymnax 1.x (`sqn_jax.adapters.gymnax`); the loop is one to
-start from for an algorithm of one's own. The network has no memory. The greedy policy is evaluated
-from the evaluation points of the map, in the same tasks every time.
+start from for an algorithm of one's own. The network has no memory. The policy is evaluated from
+the evaluation points of the map, in the same tasks every time, with actions drawn as in training:
+one without memory that takes the likeliest action turns to and fro for ever.
 """
 
 from __future__ import annotations
@@ -163,15 +164,16 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
         keys = jax.random.split(jax.random.key(1_000), options.eval_episodes)
         start = jax.vmap(tests.reset, (0, None))(keys, world)
 
-        def body(carry: Any, _: None) -> tuple[Any, Any]:
+        def body(carry: Any, key: Array) -> tuple[Any, Any]:
             obs, state = carry
-            action = network.apply(params, obs)[0].argmax(axis=1)
+            action = jax.random.categorical(key, network.apply(params, obs)[0])
             obs, state, reward, _, info = jax.vmap(tests.step_env, over_envs)(
                 keys, state, action, world
             )
             return (obs, state), (info["reached"], reward)
 
-        _, (reached, rewards) = jax.lax.scan(body, start, length=world.max_steps)
+        draws = jax.random.split(jax.random.key(2_000), world.max_steps)
+        _, (reached, rewards) = jax.lax.scan(body, start, draws)
         return reached.any(axis=0).mean(), rewards.mean()
 
     def block(runner: Runner, _: None) -> tuple[Runner, tuple[Array, Array]]:

@@ -2,8 +2,9 @@
 
 python examples/sb3_recurrent_ppo.py --out curve.json
 
-Needs the extra `sb3`. As the training goes on, the greedy policy is evaluated from the evaluation
-points of the map, in the same tasks every time; the curve is printed, and written to `--out`.
+Needs the extra `sb3`. As the training goes on, the policy is evaluated from the evaluation points
+of the map, in the same tasks every time, with actions drawn as in training: PPO's policies are
+random by nature. The curve is printed, and written to `--out`.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ NETWORK = {
 
 
 def evaluate(model: RecurrentPPO, envs: NavigationVecEnv) -> dict[str, float]:
-    """Success and mean reward a step of greedy episodes, one in each env."""
+    """Success and mean reward a step of an episode in each env."""
     envs.seed(1_000)
     obs, memory = envs.reset(), None
     starts = np.ones(envs.num_envs, bool)
     rewards = []
     while True:
-        actions, memory = model.predict(obs, memory, starts, deterministic=True)
+        actions, memory = model.predict(obs, memory, starts)
         obs, reward, starts, infos = envs.step(actions)
         rewards.append(reward)
         if starts.all():

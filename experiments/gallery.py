@@ -109,7 +109,7 @@ def foreign_trainers() -> Any:
         "PPO without memory": [recorded("purejaxrl_ppo.json")["curve"]],
         "SQN, preset quick": [recorded("four_rooms_runs.json")["runs"][0]["eval_curve"]],
     }
-    return figures.learning_curves(curves, title="Four rooms of 6 x 6 m in all, greedy episodes")
+    return figures.learning_curves(curves, title="Four rooms, 6 x 6 m together")
 
 
 def robustness() -> Any:

@@ -122,17 +122,6 @@ def _step(key: Array, state: EnvState, action: Any, env_params: EnvParams) -> Gy
     return cast(GymnaxStep, (flat(obs), *others))
 
 
-def _step_and_reset(key: Array, state: EnvState, action: Any, env_params: EnvParams) -> GymnaxStep:
-    step_key, reset_key = jax.random.split(key)
-    # Else XLA would fuse the step with what follows, and round otherwise than without a reset.
-    final_obs, state, reward, terminated, truncated, info = jax.lax.optimization_barrier(
-        _step(step_key, state, action, env_params)
-    )
-    obs, state = _reset_where(terminated | truncated, reset_key, (final_obs, state), env_params)
-    info |= {"terminated": terminated, "truncated": truncated, "final_observation": final_obs}
-    return obs, state, reward, terminated, truncated, info
-
-
 def _reset_where(
     is_over: Array, key: Array, before: tuple[Array, EnvState], env_params: EnvParams
 ) -> tuple[Array, EnvState]:
@@ -179,5 +168,16 @@ reset_once = jax.jit(_reset)
 """A key to an observation [R + G] and a state."""
 step_once = jax.jit(_step)
 """A step of one env without a reset, as `sqn_jax.step`."""
-step_and_reset = jax.jit(_step_and_reset)
-"""A step of one env, followed by a reset where the episode ends."""
+reset_where = jax.jit(_reset_where)
+
+
+def step_and_reset(key: Array, state: EnvState, action: Any, env_params: EnvParams) -> GymnaxStep:
+    """A step of one env, followed by a reset where the episode ends."""
+    # Two programs, unless the caller makes one of them: alone, each rounds as the simulator does.
+    step_key, reset_key = jax.random.split(key)
+    final_obs, state, reward, terminated, truncated, info = step_once(
+        step_key, state, action, env_params
+    )
+    obs, state = reset_where(terminated | truncated, reset_key, (final_obs, state), env_params)
+    ends = {"terminated": terminated, "truncated": truncated, "final_observation": final_obs}
+    return obs, state, reward, terminated, truncated, info | ends
