@@ -87,7 +87,7 @@ def adapters(map_name: str, num_envs: int, num_steps: int) -> dict[str, Timed]:
 
     timed: dict[str, Timed] = {}
     for mode in AutoresetMode:
-        limit = {"max_steps": 100_000} if mode is AutoresetMode.DISABLED else {}
+        limit: dict[str, Any] = {"max_steps": 100_000} if mode is AutoresetMode.DISABLED else {}
         envs = NavigationVectorEnv(map_name, num_envs, autoreset_mode=mode, **limit)
         envs.reset(seed=0)
         timed[f"gymnasium vector, {mode.value}"] = stepping(envs)
@@ -161,14 +161,14 @@ def main() -> None:
     print(table(entries))
     if options.out is not None:
         names = ("jax", "gymnasium", "stable-baselines3")
-        installed = {str(each.name).lower() for each in metadata.distributions()}
+        installed = [name for name in names if importlib.util.find_spec(name.replace("-", "_"))]
         data = {
             "command": " ".join(["experiments/bench_adapters.py", *sys.argv[1:]]),
             "map": options.map,
             "device": devices.describe(),
             "cpu": devices.cpu_model(),
             "cpu_count": os.cpu_count(),
-            "versions": {name: metadata.version(name) for name in names if name in installed},
+            "versions": {name: metadata.version(name) for name in installed},
             "adapters": entries,
         }
         options.out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

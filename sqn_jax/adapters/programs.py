@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.custom_batching import custom_vmap
 from numpy.typing import NDArray
 
 from sqn_jax.env import EnvParams, EnvState, Observation, navigation
@@ -130,7 +131,7 @@ def _reset_where(
     `vmap` alone would turn the branch into both sides of it, for all envs in every step.
     """
 
-    @jax.custom_batching.custom_vmap
+    @custom_vmap
     def choose(is_over: Array, key: Array, before: Any, params: EnvParams) -> Any:
         return jax.lax.cond(is_over, lambda: _reset(key, params), lambda: before)
 
