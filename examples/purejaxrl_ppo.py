@@ -203,7 +203,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--map", default=FOUR_ROOMS, help="as for sqn train")
     parser.add_argument("--max-steps", type=int, default=200, help="of an episode")
-    parser.add_argument("--steps", type=int, default=1_228_800, help="of all envs together")
+    parser.add_argument("--steps", type=int, default=819_200, help="of all envs together")
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--rollout-steps", type=int, default=64, help="steps between updates")
     parser.add_argument("--eval-episodes", type=int, default=100)
