@@ -149,7 +149,7 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
         transition = Transition(runner.obs, action, log_prob, value, reward, done)
         return runner._replace(env_state=env_state, obs=obs), transition
 
-    def update(runner: Runner, _: None) -> tuple[Runner, None]:
+    def update(runner: Runner) -> Runner:
         key, rollout_key, learn_key = jax.random.split(runner.key, 3)
         keys = jax.random.split(rollout_key, options.rollout_steps)
         runner, rollout = jax.lax.scan(
@@ -157,7 +157,7 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
         )
         _, last_value = network.apply(runner.learner.params, runner.obs)
         learner = learn(learn_key, runner.learner, rollout, last_value)
-        return runner._replace(learner=learner, key=key), None
+        return runner._replace(learner=learner, key=key)
 
     def evaluate(params: Any) -> tuple[Array, Array]:
         world = tests.default_params
@@ -176,9 +176,9 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
         _, (reached, rewards) = jax.lax.scan(body, start, draws)
         return reached.any(axis=0).mean(), rewards.mean()
 
-    def block(runner: Runner, _: None) -> tuple[Runner, tuple[Array, Array]]:
-        point = evaluate(runner.learner.params)
-        return jax.lax.scan(update, runner, length=per_point)[0], point
+    def block(runner: Runner, updates: Array) -> tuple[Runner, tuple[Array, Array]]:
+        runner = jax.lax.fori_loop(0, updates, lambda _, runner: update(runner), runner)
+        return runner, evaluate(runner.learner.params)
 
     def train(key: Array) -> tuple[Array, Array]:
         network_key, env_key, key = jax.random.split(key, 3)
@@ -191,9 +191,8 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
             apply_fn=network.apply, params=network.init(network_key, obs), tx=optimizer
         )
         runner = Runner(learner, env_state, obs, key)
-        runner, points = jax.lax.scan(block, runner, length=options.eval_points)
-        last = evaluate(runner.learner.params)
-        return jax.tree.map(lambda x, end: jnp.append(x, end), points, last)
+        before_each_point = jnp.full(options.eval_points + 1, per_point).at[0].set(0)
+        return jax.lax.scan(block, runner, before_each_point)[1]
 
     return train
 
