@@ -104,6 +104,16 @@ def learning_curves() -> Any:
     return figures.learning_curves(curves, title="Training in the maze")
 
 
+def foreign_trainers() -> Any:
+    """How trainers of others learn in the simulator, beside the default preset."""
+    curves = {
+        "RecurrentPPO of sb3-contrib": [recorded("sb3_recurrent_ppo.json")["curve"]],
+        "PPO without memory": [recorded("purejaxrl_ppo.json")["curve"]],
+        "SQN, preset quick": [recorded("four_rooms_runs.json")["runs"][0]["eval_curve"]],
+    }
+    return figures.learning_curves(curves, title="Four rooms, 6 x 6 m together")
+
+
 def robustness() -> Any:
     """Success under noise, from the record of the robustness runs."""
     results = recorded("pretrained_noise.json")["results"]
@@ -125,7 +135,7 @@ STILLS: dict[str, Callable[[], Any]] = {
             agents,
             trajectories,
         ),
-        *(learning_curve, learning_curves, robustness),
+        *(learning_curve, learning_curves, foreign_trainers, robustness),
     )
 }
 FILMS = {"maze": ("sqn", 8), "cave": ("best", 6)}

@@ -17,17 +17,21 @@ from sqn_jax.maps import OccupancyMap
 from sqn_jax.training.rollout import start_actors
 
 
-def small_room(length: int, **changes: Any) -> EnvParams:
+def small_room_map(length: int) -> OccupancyMap:
     """3 x 4 m, not square, with a wall in the middle and spawn points in its corners.
 
-    Episodes take `length` steps; changes are to `EnvConfig`.
+    Episodes take `length` steps.
     """
     occupied = np.zeros((30, 40), dtype=bool)
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     occupied[14:16, 12:28] = True
     corners = np.array([[0.65, 0.65], [3.35, 0.65], [0.65, 2.35], [3.35, 2.35]])
-    room = OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=length)
-    return make_env(room, EnvConfig(**changes))
+    return OccupancyMap("room", occupied, 0.1, corners, corners[:2], max_steps=length)
+
+
+def small_room(length: int, **changes: Any) -> EnvParams:
+    """The world of `small_room_map`; changes are to `EnvConfig`."""
+    return make_env(small_room_map(length), EnvConfig(**changes))
 
 
 def write_empty_room(folder: Path) -> Path:

@@ -36,8 +36,9 @@ JIT = (
     "sqn_jax/training/loop.py",
     *("sqn_jax/evaluation/baseline_episodes.py", "sqn_jax/evaluation/episodes.py"),
     "sqn_jax/evaluation/recording.py",
-    *("sqn_jax/policies/greedy.py", "sqn_jax/export/rollout.py"),
+    *("sqn_jax/policies/greedy.py", "sqn_jax/export/rollout.py", "sqn_jax/adapters/programs.py"),
     *("experiments/bench_simulator.py", "experiments/bench_learner.py"),
+    *("experiments/bench_adapters.py", "examples/purejaxrl_ppo.py"),
     *("experiments/bench_breakdown.py", "experiments/check_gpu.py", "notebooks/01_first_steps.py"),
 )
 """Files that make compiled programs; jit elsewhere would nest and hide what compiles."""
