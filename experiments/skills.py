@@ -110,7 +110,8 @@ def mutual_information(first: ArrayLike, second: ArrayLike) -> float:
     if not first.size:
         return 0.0
     joint = np.zeros((first.max() + 1, second.max() + 1))
-    np.add.at(joint, (first, second), 1 / first.size)
+    np.add.at(joint, (first, second), 1)
+    joint /= first.size
     independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
     known = joint > 0
     return float((joint[known] * np.log2(joint[known] / independent[known])).sum())
