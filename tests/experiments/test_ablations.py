@@ -119,7 +119,9 @@ def test_the_verdict_is_that_of_the_protocol(
     interval: Any, p_value: float | None, expected: str
 ) -> None:
     mean = None if interval is None else sum(interval) / 2
-    assert verdict({"difference": mean, "ci95": interval, "p_value": p_value}) == expected
+    found = {"difference": mean, "ci95": interval, "p_value": p_value}
+    assert verdict({**found, "seeds": [1] if interval is None else range(6)}) == expected
+    assert verdict({**found, "seeds": range(5)}) == "undecided"
 
 
 def test_p_values_are_adjusted_as_holm_says() -> None:
