@@ -81,13 +81,17 @@ def train_missing(options: argparse.Namespace) -> list[Path]:
     """
     folders = []
     for config in configs_of(options):
-        name = f"{config.algo}_seed{config.seed}"
-        if config.num_seeds > 1:
-            name = f"{config.algo}_seeds{config.seed}to{config.seed + config.num_seeds - 1}"
-        folder = runs_folder(options) / name
-        _train(config, folder)
+        folder = runs_folder(options) / run_name(config.algo, config)
+        train_unless_done(config, folder)
         folders.append(folder)
     return folders
+
+
+def run_name(arm: str, config: TrainConfig) -> str:
+    """The name of the folder of a run, by what is trained and its seeds."""
+    if config.num_seeds == 1:
+        return f"{arm}_seed{config.seed}"
+    return f"{arm}_seeds{config.seed}to{config.seed + config.num_seeds - 1}"
 
 
 def configs_of(options: argparse.Namespace) -> list[TrainConfig]:
@@ -105,7 +109,12 @@ def configs_of(options: argparse.Namespace) -> list[TrainConfig]:
     return [dataclasses.replace(preset, algo=algo, **changes) for algo in options.algos]
 
 
-def _train(config: TrainConfig, folder: Path) -> None:
+def train_unless_done(config: TrainConfig, folder: Path) -> None:
+    """Train a run, or resume it, unless it is finished.
+
+    Raises:
+        ValueError: the folder holds a run with other settings.
+    """
     begun = (folder / "config.json").is_file()
     if begun and RunFolder.open(folder)[1] != config:
         raise ValueError(

@@ -40,12 +40,16 @@ from sqn_jax.evaluation.statistics import bootstrap_interval
 from sqn_jax.maps import goal_fields, points_to_cells, traversable
 from sqn_jax.policies.interventions import fix_skill_weights, swap_skills
 from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.policies.run_policies import of_seed
 
 SMALL = os.environ.get("SQN_NOTEBOOKS") == "small"
 EPISODES = 6 if SMALL else 200  # of each policy on each map
 STEPS = 40 if SMALL else 0  # an episode; 0 is the map's own limit, 400, in the cave 1,200
 MAPS = ("maze",) if SMALL else ("maze", "cave")
 SEED = 1_000  # of starts and goals; the policy was trained with other ones
+# Runs or policies, all of one agent; of several, and of runs with several seeds, all seeds count
+# where the gate is changed. What stands below is of one.
+POLICIES = os.environ.get("SQN_POLICIES", "pretrained:best").split()
 
 # %% [markdown]
 # ## The episodes
@@ -54,7 +58,9 @@ SEED = 1_000  # of starts and goals; the policy was trained with other ones
 # of all that follows.
 
 # %%
-policy = find_policy("pretrained:best")
+found_policies = [find_policy(name) for name in POLICIES]
+policies = [of_seed(each, seed) for each in found_policies for seed in each.training_seeds]
+policy = policies[0]
 recorded = {
     name: record(policy, name, episodes=EPISODES, seed=SEED, max_steps=STEPS) for name in MAPS
 }
@@ -262,19 +268,36 @@ print(markdown_table(["skill 1 would", "steps overruled", *ACTION_NAMES], rows))
 # within 0.3 m of the goal with a 95 % interval; time steps count failures at the limit. (Shown are
 # intervals over episodes, by Wilson; a new run has them over routes and tasks.)
 
+
 # %%
-mean_weights = [float(weight) for weight in weights.mean(axis=0, dtype=np.float64)]
-mean_weights = [weight / sum(mean_weights) for weight in mean_weights]
-print(f"mean weights {mean_weights[0]:.3f} and {mean_weights[1]:.3f}")
-variants = {
-    "as trained": policy,
-    "skill 1 alone": fix_skill_weights(policy, (1.0, 0.0)),
-    "skill 2 alone": fix_skill_weights(policy, (0.0, 1.0)),
-    "frozen at the mean": fix_skill_weights(policy, mean_weights),
-    "one half each": fix_skill_weights(policy, (0.5, 0.5)),
-    "exchanged": swap_skills(policy),
-}
-agents = [TrainedAgent(name, (variant,)) for name, variant in variants.items()]
+def mean_weights_of(each):
+    """The mean weights of the skills over all steps up to the arrival, on all maps."""
+    those = everywhere
+    if each is not policy:
+        options = {"episodes": EPISODES, "seed": SEED, "max_steps": STEPS}
+        those = [episode for name in MAPS for episode in record(each, name, **options)]
+    steps = np.concatenate([e.skill_weights[: e.time_steps] for e in those])
+    means = [float(weight) for weight in steps.mean(axis=0, dtype=np.float64)]
+    return [weight / sum(means) for weight in means]
+
+
+def changed_gates(each):
+    """A policy with each of the changes, by name."""
+    mean_weights = mean_weights_of(each)
+    print(f"mean weights {mean_weights[0]:.3f} and {mean_weights[1]:.3f}")
+    return {
+        "as trained": each,
+        "skill 1 alone": fix_skill_weights(each, (1.0, 0.0)),
+        "skill 2 alone": fix_skill_weights(each, (0.0, 1.0)),
+        "frozen at the mean": fix_skill_weights(each, mean_weights),
+        "one half each": fix_skill_weights(each, (0.5, 0.5)),
+        "exchanged": swap_skills(each),
+    }
+
+
+of_seeds = [changed_gates(each) for each in policies]
+variants = of_seeds[0]
+agents = [TrainedAgent(name, tuple(each[name] for each in of_seeds)) for name in variants]
 settings = Settings(
     MAPS,
     episodes=EPISODES,

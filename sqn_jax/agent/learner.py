@@ -14,7 +14,7 @@ from flax import struct
 from jax import Array
 
 from sqn_jax.agent.loss import LossOutput
-from sqn_jax.agent.networks import HasObservation, Params, initial_carry
+from sqn_jax.agent.networks import GATE_BALANCE, HasObservation, Params, initial_carry
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.replay import ReplayState
 from sqn_jax.agent.shards import mean
@@ -109,13 +109,15 @@ def gradient_step(
         "gate_entropy": output.gate_entropy,
         "skill_distance": output.skill_distance,
     }
-    gradient, metrics = mean((gradient, metrics), program.axis_name)
+    gradient, metrics, load = mean((gradient, metrics, output.skill_load), program.axis_name)
     updates, opt_state = program.optimizer.update(gradient, state.opt_state, state.params)
     norm = optax.tree.norm(gradient)
     is_finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
+    new_params = optax.apply_updates(state.params, updates)
+    new_params = balanced(new_params, load, program.config.network.gate_balance_rate)
     params, opt_state = jax.tree.map(
         partial(jnp.where, is_finite),
-        (optax.apply_updates(state.params, updates), opt_state),
+        (new_params, opt_state),
         (state.params, state.opt_state),
     )
     new_state = dataclasses.replace(
@@ -126,6 +128,25 @@ def gradient_step(
         num_skipped=state.num_skipped + ~is_finite,
     )
     return new_state, output, metrics | {"gradient_norm": norm}
+
+
+def balanced(params: Params, load: Array, rate: float) -> Params:
+    """Move the bias on the logits of the skill decision against the load of the skills.
+
+    By `rate` up where a skill has less than its equal part, and down where it has more, beside the
+    gradient and without a term in the loss (Wang et al. 2024, "Auxiliary-Loss-Free Load Balancing
+    Strategy for Mixture-of-Experts"). Parameters without such a bias are returned as they are.
+
+    Args:
+        params: of any network.
+        load: [K] mean weight of each skill in the last minibatch.
+        rate: at least 0.
+    """
+    modules = params["params"]
+    if GATE_BALANCE not in modules:
+        return params
+    balance = modules[GATE_BALANCE] + rate * jnp.sign(1 / load.shape[0] - load)
+    return {**params, "params": {**modules, GATE_BALANCE: balance}}
 
 
 def average_params(state: LearnerState, fraction: float) -> LearnerState:

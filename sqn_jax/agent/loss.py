@@ -15,6 +15,7 @@ from jax import Array
 from sqn_jax.agent.networks import Params, QNetwork, QOutput
 from sqn_jax.agent.program import Program
 from sqn_jax.agent.returns import inverse_rescale, lambda_targets, n_step_targets, rescale
+from sqn_jax.agent.shards import mean
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.config import LearnerConfig
 
@@ -31,6 +32,8 @@ class LossOutput:
     """Mean entropy of the skill decision, nat; log K if it never prefers a skill."""
     skill_distance: Array
     """Mean absolute difference between the skills' Q-values and their mean."""
+    skill_load: Array
+    """[K] mean weight of each skill."""
 
 
 def r2d2_loss(
@@ -73,7 +76,7 @@ def r2d2_loss(
     )
     returns = partial(n_step_targets, n_step=config.n_step)
     targets = _targets(learned, bootstrap, discount, returns, config)
-    return _squared_error(online, targets, learned.actions, weights, config)
+    return _loss(online, targets, learned.actions, weights, program)
 
 
 def pqn_loss(
@@ -90,7 +93,7 @@ def pqn_loss(
     returns = partial(lambda_targets, trace_decay=config.trace_decay)
     targets = _targets(trajectory, bootstrap, discount, returns, config)
     weights = jnp.ones(trajectory.rewards.shape[1])
-    return _squared_error(online, targets, trajectory.actions, weights, config)
+    return _loss(online, targets, trajectory.actions, weights, program)
 
 
 def _outputs_after_burn_in(
@@ -121,31 +124,57 @@ def _targets(
     return rescale(targets) if config.value_rescaling else targets
 
 
-def _squared_error(
-    online: QOutput, targets: Array, actions: Array, weights: Array, config: LearnerConfig
+def _loss(
+    online: QOutput, targets: Array, actions: Array, weights: Array, program: Program
 ) -> tuple[Array, LossOutput]:
     """Compare the values of the actions taken [T', B] with their targets [T', B].
 
     With advantage learning (Bellemare et al. 2016) an action's target is lowered by a
     fraction alpha of what the action is worth less than the best one: the gap between them grows
     by 1 / (1 - alpha), and the best action stays the best.
+
+    With `skill_loss` "each" it is not the mixture that is compared but each skill, its squared
+    error weighted by its skill weight (Jacobs et al. 1991, eq. 1.2). Skills whose mixture is
+    compared make up for each other's errors; those compared one by one compete for the steps.
     """
+    config = program.config.learner
     predictions = _pick(online.q_values[:-1], actions)
     if config.advantage_learning > 0:
         targets -= config.advantage_learning * (online.q_values[:-1].max(axis=-1) - predictions)
-    td_errors = jax.lax.stop_gradient(targets) - predictions
-    loss = 0.5 * (weights[None] * td_errors**2).mean()
+    targets = jax.lax.stop_gradient(targets)
+    td_errors = targets - predictions
+    squared_errors = td_errors**2
+    if config.skill_loss == "each":
+        of_skills = targets[..., None] - _pick(online.skill_q_values[:-1], actions[..., None])
+        squared_errors = (online.skill_weights[:-1] * of_skills**2).sum(axis=-1)
+    loss = 0.5 * (weights[None] * squared_errors).mean()
+    entropy, load = gate_entropy(online.skill_weights).mean(), online.skill_weights.mean((0, 1))
+    if config.gate_entropy_weight > 0:
+        spread = load_entropy(load, program.axis_name)
+        loss += config.gate_entropy_weight * (entropy - spread)
     return loss, LossOutput(
         td_errors=jax.lax.stop_gradient(td_errors),
         mean_q=predictions.mean(),
-        gate_entropy=gate_entropy(online.skill_weights).mean(),
+        gate_entropy=entropy,
         skill_distance=skill_distance(online.skill_q_values).mean(),
+        skill_load=load,
     )
 
 
 def gate_entropy(skill_weights: Array) -> Array:
     """Entropy of skill decisions [..., K], nat; 0 if one skill has all the weight."""
     return -(skill_weights * jnp.log(jnp.maximum(skill_weights, 1e-12))).sum(axis=-1)
+
+
+def load_entropy(load: Array, axis_name: str | None) -> Array:
+    """Entropy of the mean weights [K] of the skills, nat; log K if all are used alike.
+
+    On several devices each is given those of its shard; the mean of the results is the entropy of
+    the mean over all, and so are the gradients. The gradient of -sum m log m is -log m, up to a
+    constant that a sum of weights of 1 takes out: what stands in the logarithm needs none.
+    """
+    of_all = jax.lax.stop_gradient(mean(load, axis_name))
+    return -(load * jnp.log(jnp.maximum(of_all, 1e-12))).sum()
 
 
 def skill_distance(skill_q_values: Array) -> Array:
@@ -155,6 +184,6 @@ def skill_distance(skill_q_values: Array) -> Array:
 
 
 def _pick(q_values: Array, actions: Array) -> Array:
-    """Values [T, B] of actions [T, B] out of [T, B, A]; the adjoint of a gather would be slow."""
+    """Values [...] of actions [...] out of [..., A]; the adjoint of a gather would be slow."""
     chosen = jax.nn.one_hot(actions, q_values.shape[-1], dtype=q_values.dtype)
     return (q_values * chosen).sum(axis=-1)

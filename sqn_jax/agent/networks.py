@@ -10,14 +10,16 @@ from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from sqn_jax.agent.gru import GRU
 from sqn_jax.agent.linear import Dense
+from sqn_jax.agent.reachability import goal_seems_reachable
 from sqn_jax.agent.refined_gru import RefinedGRU
-from sqn_jax.config import Algorithm, NetworkConfig
+from sqn_jax.config import Algorithm, EnvConfig, NetworkConfig
 
 Params = Any
 """A Linen parameter tree."""
@@ -30,6 +32,10 @@ d / (d + 5 m): as fine as the heading, so the same scale serves."""
 
 HEAD_SCALE = 0.1
 """Initial scale of Q-heads and of the skill decision: small values, no skill preferred."""
+
+GATE_BALANCE = "decision_balance"
+"""Name of the bias [K] on the logits of the skill decision, where there is one. It stands among the
+parameters, so that checkpoints, averages and target networks have it, too."""
 
 
 _CELLS: dict[str, Callable[..., GRU | RefinedGRU]] = {"gru": GRU, "refined_gru": RefinedGRU}
@@ -108,34 +114,64 @@ class SkillQNetwork(nn.Module):
 
     config: NetworkConfig
     num_actions: int
+    sensors: EnvConfig
+    """What the gate `reachable` reads the observation by; nothing else depends on it."""
 
     @nn.compact
     def __call__(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
         """Return the next carry [B, H] and the Q-values for observations [T, B, ...]."""
         size, norm = self.config.hidden_size, self.config.layer_norm
-        num_skills = self.config.num_skills
         features = Features(size, self.config.motion_inputs, name="features")(obs)  # eq. 1
         cell = _CELLS[self.config.cell](size, name="perception")
         carry, perception = cell(features, carry)  # eq. 2
 
-        decision = MLP(size, num_skills, norm, output_scale=HEAD_SCALE, name="decision")
-        z_decision = decision(perception + self._embedding("decision"))  # eq. 3
-        skill_weights = nn.softmax(z_decision, axis=-1)  # eq. 4
+        if self.config.gate == "learned":
+            skill_weights = self._decision(perception)
+        else:
+            skill_weights = _fixed_gate(obs, self.config, self.sensors)
 
         each_skill = []
-        for name in [f"skill_{index}" for index in range(num_skills)]:
+        for name in [f"skill_{index}" for index in range(self.config.num_skills)]:
             skill = MLP(size, self.num_actions, norm, output_scale=HEAD_SCALE, name=name)
-            each_skill.append(skill(perception + self._embedding(name)))  # eq. 5
+            each_skill.append(skill(self._embedded(perception, name)))  # eq. 5
         skill_q_values = jnp.stack(each_skill, axis=-2)
 
         q_values = (skill_weights[..., None] * skill_q_values).sum(axis=-2)  # eq. 6
         return carry, QOutput(q_values, skill_weights, skill_q_values)
 
-    def _embedding(self, name: str) -> Array:
-        """The learnable embedding e_mod of a module [1, 1, H]; small, so as not to drown z."""
-        shape = (self.config.hidden_size,)
-        embedding: Array = self.param(f"{name}_embedding", nn.initializers.normal(0.02), shape)
-        return embedding[None, None]
+    def _decision(self, perception: Array) -> Array:
+        """The skill decision eta [T, B, K] of perceptions [T, B, H]."""
+        config = self.config
+        decision = MLP(
+            *(config.hidden_size, config.num_skills, config.layer_norm),
+            output_scale=HEAD_SCALE,
+            name="decision",
+        )
+        z_decision = decision(self._embedded(perception, "decision"))  # eq. 3
+        if config.gate_balance_rate > 0:
+            # No gradient: the learner moves it by the load of the skills (`learner.balanced`).
+            balance = self.param(GATE_BALANCE, nn.initializers.zeros, (config.num_skills,))
+            z_decision += jax.lax.stop_gradient(balance)[None, None]
+        if config.gate_temperature != 1:
+            z_decision /= config.gate_temperature
+        return nn.softmax(z_decision, axis=-1)  # eq. 4
+
+    def _embedded(self, perception: Array, name: str) -> Array:
+        """The perception [T, B, H] plus the learnable embedding e_mod of a module."""
+        if not self.config.module_embeddings:
+            return perception
+        # Small, so as not to drown z.
+        initializer, shape = nn.initializers.normal(0.02), (self.config.hidden_size,)
+        embedding: Array = self.param(f"{name}_embedding", initializer, shape)
+        return perception + embedding[None, None]
+
+
+def _fixed_gate(obs: HasObservation, config: NetworkConfig, sensors: EnvConfig) -> Array:
+    """Skill weights [T, B, K] that are not learned, for observations [T, B, ...]."""
+    if config.gate == "equal":
+        return jnp.full((*obs.goal.shape[:2], config.num_skills), 1 / config.num_skills)
+    reachable = goal_seems_reachable(obs.ranges, obs.goal, sensors)
+    return jnp.stack([reachable, ~reachable], axis=-1).astype(jnp.float32)
 
 
 class RecurrentQNetwork(nn.Module):
@@ -150,7 +186,8 @@ class RecurrentQNetwork(nn.Module):
         size, norm = self.config.hidden_size, self.config.layer_norm
         features = Features(size, self.config.motion_inputs, name="features")(obs)
         carry, perception = _CELLS[self.config.cell](size, name="perception")(features, carry)
-        head = MLP(size, self.num_actions, norm, output_scale=HEAD_SCALE, name="skill_0")
+        width = size * self.config.r2d2_width_factor
+        head = MLP(width, self.num_actions, norm, output_scale=HEAD_SCALE, name="skill_0")
         return carry, _single_head(head(perception))
 
 
@@ -185,16 +222,29 @@ def _single_head(q_values: Array) -> QOutput:
 
 QNetwork = SkillQNetwork | RecurrentQNetwork | FeedForwardQNetwork
 
-_NETWORKS: dict[str, Callable[..., QNetwork]] = {
-    "sqn": SkillQNetwork,
+_SINGLE_HEADS: dict[str, Callable[..., QNetwork]] = {
     "r2d2": RecurrentQNetwork,
     "dqn": FeedForwardQNetwork,
 }
 
 
-def make_network(algo: Algorithm, config: NetworkConfig, num_actions: int) -> QNetwork:
-    """The network of an agent."""
-    return _NETWORKS[algo](config, num_actions)
+def make_network(
+    algo: Algorithm, config: NetworkConfig, num_actions: int, sensors: EnvConfig | None = None
+) -> QNetwork:
+    """The network of an agent.
+
+    Args:
+        algo: which of the three.
+        config: its sizes and switches.
+        num_actions: A.
+        sensors: of the robot, for the gate `reachable`; None: those of the paper. Networks that do
+            not read it are equal whatever it is.
+    """
+    if algo != "sqn":
+        return _SINGLE_HEADS[algo](config, num_actions)
+    if sensors is None or config.gate != "reachable":
+        sensors = EnvConfig()
+    return SkillQNetwork(config, num_actions, sensors)
 
 
 def initial_carry(config: NetworkConfig, batch_size: int) -> Array:

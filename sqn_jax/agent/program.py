@@ -63,7 +63,8 @@ class Program:
     @cached_property
     def network(self) -> QNetwork:
         """The agent."""
-        return make_network(self.config.algo, self.config.network, self.num_actions)
+        config = self.config
+        return make_network(config.algo, config.network, self.num_actions, config.env)
 
     @cached_property
     def optimizer(self) -> optax.GradientTransformation:

@@ -142,12 +142,33 @@ class NetworkConfig:
     cell: Literal["gru", "refined_gru"] = "gru"
     """sqn, r2d2: the recurrent unit; the refined one scales its candidate by the input and learns
     how its update gate saturates."""
+    gate: Literal["learned", "equal", "reachable"] = "learned"
+    """sqn: how the skill weights come about: learned (eq. 3 and 4), all equal, or set by hand, all
+    weight on the first of two skills while the goal is reachable (eq. 8) and else on the second."""
+    gate_temperature: float = 1.0
+    """learned gate: what the logits of the skill decision are divided by before the softmax."""
+    gate_balance_rate: float = 0.0
+    """learned gate: step by which a bias on the logit of each skill moves after an update, up for a
+    skill with less than its equal part of the weight and else down; 0: no bias."""
+    module_embeddings: bool = True
+    """sqn: the skill decision and each skill add an embedding of their own to the perception."""
+    r2d2_width_factor: int = 1
+    """r2d2: how much wider the hidden layer of the head is; 3 is as wide as those of two skills and
+    the decision between them."""
 
     def __post_init__(self) -> None:
         require_known_choices(self, "network")
-        for name in ("hidden_size", "num_skills", "dqn_width_factor"):
+        for name in ("hidden_size", "num_skills", "dqn_width_factor", "r2d2_width_factor"):
             value = getattr(self, name)
             require(value >= 1, f"network.{name}", value, "at least 1")
+        require_positive(self, "network", "gate_temperature")
+        require_not_negative(self, "network", "gate_balance_rate")
+        require(
+            self.gate != "reachable" or self.num_skills == 2,
+            "network.num_skills",
+            self.num_skills,
+            "2 with network.gate reachable: one skill for a goal that is, one for all else",
+        )
         require_within_limits(self, "network")
 
 
@@ -222,6 +243,12 @@ class LearnerConfig:
     """pqn: a robot that is at its goal at the end of a window gets a new task."""
     advantage_learning: float = 0.0
     """Alpha of advantage learning, which widens the gaps between actions; 0: plain Q-learning."""
+    skill_loss: Literal["mixture", "each"] = "mixture"
+    """sqn: what is compared with the target: the weighted sum of the skills (eq. 6), or each skill,
+    its squared error weighted by its skill weight."""
+    gate_entropy_weight: float = 0.0
+    """sqn: c of the loss term c (mean H(eta) - H(mean eta)), which makes each decision clear and
+    uses all skills; 0: no term."""
 
     def __post_init__(self) -> None:
         require_known_choices(self, "learner")
@@ -233,6 +260,7 @@ class LearnerConfig:
         for name in ("burn_in_length", "window_length"):
             value = getattr(self, name)
             require(value >= 0, f"learner.{name}", value, "0 or a positive number")
+        require_not_negative(self, "learner", "gate_entropy_weight")
         fractions = ("trace_decay", "average_share", "advantage_learning")
         for name in ("discount", "discount_start", *fractions):
             value = getattr(self, name)

@@ -42,6 +42,10 @@ LIMITS: dict[str, tuple[float, float]] = {
     "network.hidden_size": (1, 65_536),
     "network.num_skills": (1, 1024),
     "network.dqn_width_factor": (1, 1024),
+    "network.r2d2_width_factor": (1, 1024),
+    "network.gate_temperature": (1e-3, 1e3),
+    "network.gate_balance_rate": (0, 1e3),
+    "learner.gate_entropy_weight": (0, 1e6),
     "exploration.decay_fraction": (1e-6, 1),
     "learner.target_update_rate": (1e-9, 1),
     "learner.n_step": (1, 1000),  # Each is written out in the compiled program.

@@ -7,6 +7,7 @@ notebook. Animations are made by `frames`, `gif` and `mp4`.
 from sqn_jax.figures.animation import frames, gif, mp4
 from sqn_jax.figures.commands import commands
 from sqn_jax.figures.curves import gate_entropy_curves, learning_curve, learning_curves
+from sqn_jax.figures.differences import paired_differences
 from sqn_jax.figures.episode import coverage_example, reachability_example
 from sqn_jax.figures.gallery import map_gallery, map_picture, observation_patterns
 from sqn_jax.figures.network import network_architecture
@@ -36,6 +37,7 @@ __all__ = [
     "mp4",
     "network_architecture",
     "observation_patterns",
+    "paired_differences",
     "picture",
     "reachability_example",
     "robustness",

@@ -89,15 +89,19 @@ def _known_modules(modules: Tree) -> Tree:
     Raises:
         ValueError: there is one that the drawing has no place for.
     """
-    places = {"features", "perception", "norm", "decision", "decision_embedding"}
+    places = {"features", "perception", "norm"}
+    places |= {"decision", "decision_embedding", "decision_balance"}
     skills = set(_skills(modules))
     places |= skills | {f"{name}_embedding" for name in skills}
     unknown = sorted(set(modules) - places)
     if unknown:
         raise ValueError(f"the network has {', '.join(unknown)}, expected {', '.join(places)}")
-    if "norm" not in modules:
-        return modules
-    return {**modules, "perception": {**modules["perception"], "norm": modules["norm"]}}
+    modules = dict(modules)
+    if "norm" in modules:
+        modules["perception"] = {**modules["perception"], "norm": modules["norm"]}
+    if "decision_balance" in modules:
+        modules["decision"] = {**modules["decision"], "balance_bias": modules["decision_balance"]}
+    return modules
 
 
 def _skills(modules: Tree) -> list[str]:
@@ -242,23 +246,30 @@ def _draw_output(axes: Axes, modules: Tree, boxes: Mapping[str, _Box]) -> None:
     middle = (skills[0].middle + skills[-1].middle) / 2
     actions = modules[_skills(modules)[0]]["output"]["kernel"].shape[1]
     start = skills[0].right
-    if "decision" in boxes:
-        width, lowest = 0.85, skills[-1]
-        decision = boxes["decision"]
-        softmax = _Box(_WEIGHTS, decision.middle, 0.4, width)
-        total = _Box(_WEIGHTS, middle, skills[0].top - lowest.top + lowest.height, width)
-        for box, text in ((softmax, "softmax"), (total, "weighted\nsum")):
-            _draw_frame(axes, box, _GRAY)
-            _draw_note(axes, box.left + width / 2, box.middle, text, fontweight="bold")
-        _draw_arrow(axes, (decision.right, softmax.middle), (softmax.left, softmax.middle))
+    if "decision" in boxes or len(skills) > 1:
+        lowest = skills[-1]
+        height = skills[0].top - lowest.top + lowest.height
+        total = _draw_operation(axes, middle, height, "weighted\nsum")
         _draw_skill_arrows(axes, skills, total)
-        x = total.left + width / 2
+        start = total.right
+    if "decision" in boxes:
+        decision = boxes["decision"]
+        softmax = _draw_operation(axes, decision.middle, 0.4, "softmax")
+        _draw_arrow(axes, (decision.right, softmax.middle), (softmax.left, softmax.middle))
+        x = total.left + total.width / 2
         _draw_arrow(axes, (x, softmax.middle - softmax.height / 2), (x, total.top))
         count = modules["decision"]["output"]["kernel"].shape[1]
         _draw_note(axes, x + 0.07, softmax.middle - 0.42, f"{count} skill\nweights", ha="left")
-        start = total.right
     _draw_arrow(axes, (start, middle), (start + 0.25, middle))
     _draw_note(axes, start + 0.29, middle, f"Q\n{actions}", ha="left")
+
+
+def _draw_operation(axes: Axes, middle: float, height: float, text: str) -> _Box:
+    """Draw what has no parameters, in the column after the modules; return its box."""
+    box = _Box(_WEIGHTS, middle, height, 0.85)
+    _draw_frame(axes, box, _GRAY)
+    _draw_note(axes, box.left + box.width / 2, box.middle, text, fontweight="bold")
+    return box
 
 
 def _draw_skill_arrows(axes: Axes, skills: Sequence[_Box], total: _Box) -> None:

@@ -65,7 +65,7 @@ def example_obs(config: TrainConfig) -> Observation:
 
 def network_of(config: TrainConfig) -> QNetwork:
     """The network that a run trains."""
-    return make_network(config.algo, config.network, NUM_ACTIONS)
+    return make_network(config.algo, config.network, NUM_ACTIONS, config.env)
 
 
 def params_shapes(config: TrainConfig) -> Params:
@@ -92,13 +92,15 @@ def _require_sensible(config: TrainConfig) -> None:
         )
     size = network.hidden_size
     width = size * (network.dqn_width_factor if config.algo == "dqn" else 1)
-    heads = network.num_skills + 1 if config.algo == "sqn" else 1
+    heads_of = {"sqn": network.num_skills + 1, "r2d2": network.r2d2_width_factor, "dqn": 1}
+    heads = heads_of[config.algo]
     count = config.num_seeds * ((beams + 2 * size) * size + 2 * size * width + heads * width**2)
     if count > MAX_PARAMETERS:
         raise ValueError(
             f"network.hidden_size {size}, network.num_skills {network.num_skills}, "
-            f"network.dqn_width_factor {network.dqn_width_factor}, env.num_beams {beams} and "
-            f"num_seeds {config.num_seeds} are {count:,} parameters or more, expected at most "
+            f"network.dqn_width_factor {network.dqn_width_factor}, network.r2d2_width_factor "
+            f"{network.r2d2_width_factor}, env.num_beams {beams} and num_seeds "
+            f"{config.num_seeds} are {count:,} parameters or more, expected at most "
             f"{MAX_PARAMETERS:,}"
         )
 

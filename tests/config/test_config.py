@@ -22,6 +22,7 @@ SIGNED = {"env.reward_navigation", "env.reward_exploration", "env.reward_time"}
 AT_LEAST_ONE = {
     *("env.ray_iterations", "network.hidden_size", "network.num_skills"),
     *("network.dqn_width_factor", "replay.capacity", "replay.min_episodes"),
+    "network.r2d2_width_factor",
     *("learner.batch_size", "learner.n_step", "learner.num_passes", "eval.episodes"),
     "eval.curve_episodes",
     *("num_seeds", "total_episodes", "num_envs", "updates_per_round", "rounds_per_chunk"),
@@ -29,7 +30,7 @@ AT_LEAST_ONE = {
 POSITIVE = {
     *("env.max_range", "env.time_step", "env.goal_radius", "env.max_goal_distance"),
     *("env.coverage_cell", "env.field_of_view_deg", "learner.learning_rate"),
-    "env.goal_distance_scale",
+    *("env.goal_distance_scale", "network.gate_temperature"),
     *("learner.adam_epsilon", "learner.max_grad_norm", "learner.target_update_rate"),
     *("exploration.decay_fraction", "checkpoint_minutes"),
 }
@@ -189,6 +190,7 @@ def test_the_refusal_of_a_choice_lists_what_there_is(name: str) -> None:
         ({"replay": {"capacity": 100, "min_episodes": 101}}, "replay.min_episodes"),
         ({"method": "pqn", "num_envs": 50, "learner": {"batch_size": 20}}, "learner.batch_size"),
         ({"method": "pqn", "num_envs": 50, "learner": {"batch_size": 100}}, "learner.batch_size"),
+        ({"network": {"gate": "reachable", "num_skills": 3}}, "network.num_skills"),
     ],
 )
 def test_settings_that_do_not_fit_together_are_refused(changes: dict[str, Any], name: str) -> None:
@@ -252,7 +254,9 @@ def changed_everywhere() -> TrainConfig:
             range_noise_unit="absolute",
         ),
         randomization=config_module.RandomizationConfig(0.1, 0.2, 0.3, True),
-        network=config_module.NetworkConfig(9, 3, True, 2, True, "refined_gru"),
+        network=config_module.NetworkConfig(
+            9, 3, True, 2, True, "refined_gru", "equal", 2.0, 0.1, False, 4
+        ),
         replay=ReplayConfig(60, 30, False, 0.5, 0.25, 0.75),
         learner=LearnerConfig(
             10,
@@ -273,6 +277,8 @@ def changed_everywhere() -> TrainConfig:
             2,
             True,
             0.25,
+            "each",
+            0.75,
         ),
         exploration=config_module.ExplorationConfig(0.9, 0.3, 0.5, True),
         eval=config_module.EvalConfig(12, 34, 5, 6),

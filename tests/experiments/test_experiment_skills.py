@@ -7,8 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.skills import variants, weights_by_situation
+from experiments.skills import (
+    AS_IT_IS,
+    information,
+    mutual_information,
+    over_seeds,
+    variants,
+    weights_by_situation,
+    weights_over_time,
+)
 from sqn_jax.agent import QOutput, Trajectory
+from sqn_jax.env import Observation
 from sqn_jax.policies.pretrained import load_pretrained
 
 
@@ -54,3 +63,70 @@ def test_a_situation_that_never_came_is_not_told() -> None:
 def test_every_skill_is_tried_alone() -> None:
     names = list(variants(load_pretrained("sqn")))
     assert names == ["as it is", "skill 1 alone", "skill 2 alone", "exchanged"]
+
+
+def test_mutual_information_by_hand() -> None:
+    coin = np.array([0, 1, 0, 1])
+    assert mutual_information(coin, coin) == pytest.approx(1.0)
+    assert mutual_information(coin, 1 - coin) == pytest.approx(1.0)
+    assert mutual_information(coin, [0, 0, 1, 1]) == pytest.approx(0.0)
+    assert mutual_information(coin, np.zeros(4, int)) == pytest.approx(0, abs=1e-12)
+    # Joint 1/2, 1/4, 0, 1/4; marginals 3/4, 1/4 and 1/2, 1/2.
+    expected = 0.5 * np.log2(0.5 / 0.375) + 0.25 * np.log2(0.25 / 0.375) + 0.25 * np.log2(2)
+    assert mutual_information([0, 0, 0, 1], [0, 0, 1, 1]) == pytest.approx(expected)
+    assert mutual_information([], []) == 0.0
+
+
+def test_information_is_about_the_step_that_a_skill_saw_and_up_to_the_arrival() -> None:
+    """Skill 2 has the weight right after each step in which the goal was reachable."""
+    rng = np.random.default_rng(0)
+    reachable = rng.random((40, 30)) < 0.5
+    second = np.concatenate([rng.random((1, 30)) < 0.5, reachable[:-1]]).astype(float)
+    second[20:] = rng.random((20, 30)) < 0.5  # After the arrival anything may be.
+    near = rng.random((41, 30)) < 0.5
+    weights: Any = np.stack([1 - second, second], axis=-1)
+    info = {
+        "reward_navigation": np.where(reachable, 0.1, 0.0),
+        "goal_distance": np.full((40, 30), 5.0),
+        "covered_area": np.zeros((40, 30)),
+        "collision": np.zeros((40, 30), bool),
+    }
+    ranges: Any = np.where(near, 0.04, 0.5)[..., None]
+    obs = Observation(ranges=ranges, goal=ranges)
+    given = Trajectory(info=info, obs=obs, output=QOutput(weights, weights, weights))
+    found = information(given, np.full(30, 20), max_range=5.0)
+    shares = np.array([reachable[:19].mean(), 1 - reachable[:19].mean()])
+    entropy = -(shares * np.log2(shares)).sum()
+    assert found["goal reachable"]["bits"] == pytest.approx(entropy)
+    assert found["goal reachable"]["by_chance"] < 0.05
+    assert found["wall near"]["bits"] < 0.05
+    assert found["situation"]["bits"] == pytest.approx(0, abs=1e-12)
+    near[1:20] = reachable[:19]
+    ranges = np.where(near, 0.04, 0.5)[..., None]
+    moved = Trajectory(info=info, obs=Observation(ranges, ranges), output=given.output)
+    again = information(moved, np.full(30, 20), max_range=5.0)
+    assert again["wall near"]["bits"] == pytest.approx(entropy)
+
+
+def test_weights_over_time_are_those_of_quarters_of_the_way() -> None:
+    weights = np.zeros((10, 2, 1))
+    weights[:8, 0, 0], weights[8:, 0, 0] = np.repeat([1, 2, 3, 4], 2), 99  # Arrives at step 8.
+    weights[:4, 1, 0], weights[4:, 1, 0] = [5, 6, 7, 8], 99
+    # Of each quarter two steps of the first robot and one of the second.
+    expected = [[(2 * a + b) / 3] for a, b in ((1, 5), (2, 6), (3, 7), (4, 8))]
+    np.testing.assert_allclose(weights_over_time(weights, np.array([8, 4])), expected)
+
+
+def test_the_table_has_the_mean_over_seeds_and_each_of_them() -> None:
+    def seed(success: float, alone: float) -> dict[str, Any]:
+        about = {"goal reachable": {"bits": success / 10, "by_chance": 0.01}}
+        entry = {"success": success, "mean_weights": [0.3, 0.7], "information": about}
+        return {"maps": {"maze": {AS_IT_IS: entry, "skill 1 alone": {"success": alone}}}}
+
+    rows = {row[1]: row for row in over_seeds([seed(0.8, 0.1), seed(0.6, 0.3)])}
+    # Student's t of one degree of freedom is 12.706; the standard error is 0.1.
+    assert rows["success as it is"][2:] == ["0.700 [-0.571, 1.971]", "0.800, 0.600"]
+    assert rows["success skill 1 alone"][3] == "0.100, 0.300"
+    assert rows["largest mean weight"][2] == "0.700 [0.700, 0.700]"
+    assert rows["bits about goal reachable"][3] == "0.080, 0.060"
+    assert over_seeds([seed(0.8, 0.1)])[0][2] == "0.800"

@@ -137,7 +137,9 @@ def test_the_seeds_of_an_agent_are_trained_side_by_side_in_one_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = []
-    monkeypatch.setattr(common, "_train", lambda config, folder: trained.append((config, folder)))
+    monkeypatch.setattr(
+        common, "train_unless_done", lambda config, folder: trained.append((config, folder))
+    )
     for num_seeds in ("3", "1"):
         parser = argparse.ArgumentParser()
         common.add_options(parser)

@@ -360,7 +360,11 @@ def test_a_move_that_fails_brings_the_old_export_back(
 def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> None:
     """One that is new stands in neither list: whoever adds it decides here."""
     refused = {
-        NetworkConfig: {"cell": "refined_gru", "motion_inputs": True},
+        NetworkConfig: {
+            **{"cell": "refined_gru", "motion_inputs": True, "gate": "equal"},
+            **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "module_embeddings": False},
+            "r2d2_width_factor": 3,
+        },
         EnvConfig: {"goal_distance_encoding": "rational", "goal_distance_scale": 7.0},
     }
     require_exportable(TrainConfig())

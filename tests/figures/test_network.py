@@ -23,6 +23,9 @@ NETWORKS = {
     "R2D2": replace(QUICK, algo="r2d2"),
     "DQN": replace(QUICK, algo="dqn"),
     "last motion": replace(QUICK, network=replace(QUICK.network, motion_inputs=True)),
+    "equal weights": replace(QUICK, network=replace(QUICK.network, gate="equal")),
+    "balanced": replace(QUICK, network=replace(QUICK.network, gate_balance_rate=0.1)),
+    "no embeddings": replace(QUICK, network=replace(QUICK.network, module_embeddings=False)),
 }
 
 

@@ -20,6 +20,7 @@ from sqn_jax.policies.interventions import (
     single_head,
     swap_skills,
     with_motion_inputs,
+    without_skill,
 )
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.training.motion import MotionObservation
@@ -67,6 +68,41 @@ def test_a_skill_gets_the_weight_of_the_one_it_changes_places_with(policy: Polic
             after.skill_weights, before.skill_weights[..., places], rtol=1e-4, atol=1e-7
         )
         np.testing.assert_array_equal(after.skill_q_values, before.skill_q_values)
+
+
+def test_without_a_skill_the_others_divide_its_weight() -> None:
+    """Also where the gate is balanced and its softmax warmed."""
+    changes = {"gate_balance_rate": 0.1, "gate_temperature": 3.0}
+    config = dataclasses.replace(
+        CONFIG, network=dataclasses.replace(CONFIG.network, **changes), num_seeds=1
+    )
+    network = make_network("sqn", config.network, NUM_ACTIONS)
+    policy = Policy("made up", config, (random_params(network, small_room(9)),))
+    before = outputs(policy)
+    assert np.ptp(before.skill_weights, axis=0).max() > 0.1
+    for skill in (0, 2):
+        after = outputs(without_skill(policy, skill))
+        expected = np.array(before.skill_weights)
+        expected[..., skill] = 0
+        expected /= expected.sum(axis=-1, keepdims=True)
+        np.testing.assert_allclose(after.skill_weights, expected, rtol=1e-4, atol=1e-7)
+        np.testing.assert_array_equal(after.skill_q_values, before.skill_q_values)
+    fixed, swapped = fix_skill_weights(policy, (0.2, 0.0, 0.8)), swap_skills(policy, (1, 2, 0))
+    np.testing.assert_allclose(outputs(fixed).skill_weights[3, 1], [0.2, 0.0, 0.8], atol=1e-6)
+    turned = before.skill_weights[..., [1, 2, 0]]
+    np.testing.assert_allclose(outputs(swapped).skill_weights, turned, rtol=1e-4, atol=1e-7)
+
+
+def test_nothing_is_taken_from_a_gate_that_was_not_learned_or_has_one_skill() -> None:
+    for changes, expected in (
+        ({"gate": "equal"}, "policy made up: its network.gate is equal, expected learned"),
+        ({"num_skills": 1}, "skill is 0, expected a policy with several skills"),
+        ({}, "skill is 3, expected 0 to 2"),
+    ):
+        network = dataclasses.replace(CONFIG.network, **changes)
+        policy = Policy("made up", dataclasses.replace(CONFIG, network=network), ({},))
+        with pytest.raises(ValueError, match=f"^{expected}$"):
+            without_skill(policy, 0 if changes else 3)
 
 
 @pytest.mark.parametrize("skill", [0, 1, 2])

@@ -1,0 +1,208 @@
+"""Arms beside each other: which runs are made, and what is said of them, by hand and by SciPy."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from experiments import ablations
+from experiments.ablations import ARENAS, ARMS, decision, parse_changes, planned_runs, with_settings
+from experiments.arm_statistics import (
+    arm_results,
+    arms_table,
+    holm,
+    paired_by_seed,
+    seed_interval,
+    verdict,
+)
+from experiments.power import paired_differences, power, runs_on_record
+from sqn_jax import figures
+from sqn_jax.config import TrainConfig
+
+
+@pytest.mark.parametrize("name", list(ARENAS))
+def test_the_runs_of_an_arena_differ_in_what_their_arms_say_and_in_their_seeds(name: str) -> None:
+    arena = ARENAS[name]
+    runs = planned_runs(arena)
+    assert len({run.name for run in runs}) == len(runs) == sum(arena.seeds.values())
+    plain = {run.config.seed: run.config for run in runs if run.arm == "sqn"}
+    for run in runs:
+        assert run.arm == "sqn" or run.config != plain[run.config.seed]
+        if run.config.seed == 10:  # To change settings takes its time.
+            assert run.config == with_settings(plain[10], ARMS[run.arm])
+    # Whatever the budget leaves, the arms that decide have the same seeds, or one more.
+    for count in range(1, len(runs) + 1):
+        begun = [run.arm for run in runs[:count]]
+        assert abs(begun.count("sqn") - begun.count("r2d2")) <= 1
+    assert set(arena.primary) <= set(arena.maps)
+
+
+def test_seeds_of_ones_own_and_side_by_side() -> None:
+    arena = ARENAS["quick"]
+    names = [run.name for run in planned_runs(arena, ["sqn", "dqn"], [3, 4])]
+    assert names == ["sqn_seed3", "dqn_seed3", "sqn_seed4", "dqn_seed4"]
+    wide = planned_runs(arena, ["r2d2"], num_seeds=5)
+    assert [run.name for run in wide] == ["r2d2_seeds10to14", "r2d2_seeds15to19"]
+    with pytest.raises(ValueError, match=r"--seeds \[3, 4\] with --num-seeds 2: seeds come twice"):
+        planned_runs(arena, ["sqn"], [3, 4], 2)
+    (run,) = planned_runs(arena, ["sqn"], [3], 1, {"learner.discount": 0.9, "seed": 7})
+    assert (run.config.learner.discount, run.config.seed) == (0.9, 3)
+
+
+@pytest.mark.parametrize(
+    ("texts", "fault"),
+    [
+        (["discount"], "--set discount: expected NAME=VALUE"),
+        (["learner.speed=3"], "learner.speed is 3, expected one of the fields"),
+        (["lerner.discount=0.9"], "lerner.discount: no such setting"),
+        (["learner.discount=much"], "learner.discount is 'much', expected a value of type float"),
+        (["learner.discount=1.5"], "learner.discount is 1.5, expected"),
+    ],
+)
+def test_settings_that_are_none_are_refused_by_name(texts: list[str], fault: str) -> None:
+    with pytest.raises(ValueError, match=f"^{fault}"):
+        with_settings(TrainConfig(), parse_changes(texts))
+
+
+def test_no_run_is_begun_that_the_budget_has_no_room_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(ablations.time, "monotonic", lambda: clock[0])
+
+    def train(config: TrainConfig, folder: Path) -> None:
+        clock[0] += 250.0
+
+    monkeypatch.setattr(ablations, "train_unless_done", train)
+    monkeypatch.setattr(ablations, "scores_of", lambda *arguments: [])
+    runs = planned_runs(ARENAS["smoke"])
+    # Two runs take 500 s of 720; for a third there is no room, unless it is there already.
+    done = [run.name for run, *_ in ablations.train_within(runs, ARENAS["smoke"], tmp_path, 12)]
+    assert done == ["sqn_seed10", "r2d2_seed10"]
+    assert "not trained: equal_seed10, sqn_seed11, r2d2_seed11" in capsys.readouterr().out
+
+
+def test_intervals_over_seeds_are_student_s_and_the_test_is_exact() -> None:
+    first = {10: 0.75, 11: 0.76, 12: 0.71, 13: 0.80, 14: 0.9}
+    second = {10: 0.70, 11: 0.72, 12: 0.72, 13: 0.74, 99: 0.1}
+    found = paired_by_seed(first, second)
+    differences = np.array([0.05, 0.04, -0.01, 0.06])
+    assert found["seeds"] == [10, 11, 12, 13]
+    assert found["difference"] == pytest.approx(0.035)
+    theirs = stats.ttest_1samp(differences, 0).confidence_interval()
+    assert found["ci95"] == pytest.approx(list(theirs))
+    # Of the 16 ways of exchanging, those with as large a sum: all as they are, the third turned,
+    # and the same with all turned.
+    assert found["p_value"] == pytest.approx(4 / 16)
+    assert seed_interval([0.7]) is None
+    assert paired_by_seed({1: 0.5}, {2: 0.5})["difference"] is None
+
+
+@pytest.mark.parametrize(
+    ("interval", "p_value", "expected"),
+    [
+        ((0.01, 0.05), 0.01, "yes"),
+        ((0.005, 0.018), 0.001, "no"),  # More, but too little to count.
+        ((-0.03, 0.01), 0.4, "no"),
+        ((-0.09, -0.01), 0.01, "no"),
+        ((-0.01, 0.05), 0.2, "undecided"),
+        ((-0.05, 0.03), 0.6, "undecided"),
+        (None, None, "undecided"),
+    ],
+)
+def test_the_verdict_is_that_of_the_protocol(
+    interval: Any, p_value: float | None, expected: str
+) -> None:
+    mean = None if interval is None else sum(interval) / 2
+    found = {"difference": mean, "ci95": interval, "p_value": p_value}
+    assert verdict({**found, "seeds": [1] if interval is None else range(6)}) == expected
+    assert verdict({**found, "seeds": range(5)}) == "undecided"
+
+
+def test_p_values_are_adjusted_as_holm_says() -> None:
+    # Ascending 0.01 x 4, 0.03 x 3, 0.04 x 2 (at least the one before), 0.5.
+    assert holm([0.04, 0.01, 0.5, 0.03]) == pytest.approx([0.09, 0.04, 0.5, 0.09])
+    assert holm([0.9, 0.8]) == pytest.approx([1.0, 1.0])
+    assert holm([]) == []
+
+
+def rows(spl: dict[int, float], name: str = "maze", tasks: str = "random pairs") -> list[Any]:
+    return [
+        {"seed": seed, "map": name, "tasks": tasks, "epsilon": 0.0}
+        | {"spl": value, "success": value + 0.2, "time_steps": 80.0}
+        for seed, value in spl.items()
+    ]
+
+
+def test_arms_are_compared_on_their_common_seeds_map_by_map() -> None:
+    spl = {"sqn": {10: 0.70, 11: 0.76}, "r2d2": {10: 0.66, 11: 0.70}, "dqn": {10: 0.5}}
+    scores = {
+        arm: [
+            row
+            for name in ("maze", "maze:100", "maze:101")
+            for tasks in ("evaluation points", "random pairs")
+            for row in rows(of_seeds, name, tasks)
+        ]
+        for arm, of_seeds in spl.items()
+    }
+    (lower,) = (
+        row
+        for row in scores["sqn"]
+        if (row["map"], row["tasks"], row["seed"]) == ("maze:101", "random pairs", 10)
+    )
+    lower["spl"] = 0.4
+    results = arm_results(scores, reference="sqn")
+    found = {(entry["maps"], entry["tasks"], entry["arm"]): entry for entry in results}
+    first = found["maze", "random pairs", "r2d2"]
+    assert results[0] == found["maze", "random pairs", "sqn"]
+    assert first["difference"] == pytest.approx(-0.05)
+    assert first["spl"]["mean"] == pytest.approx(0.68)
+    assert first["success"]["mean"] == pytest.approx(0.88)
+    assert found["maze", "random pairs", "dqn"]["difference"] == pytest.approx(-0.2)
+    assert found["maze", "random pairs", "dqn"]["difference_ci95"] is None
+    # The unseen mazes are judged together: 0.70 and 0.4 of seed 10, 0.76 of seed 11.
+    assert found["mazes unseen", "random pairs", "sqn"]["spl"]["mean"] == pytest.approx(0.655)
+    table = arms_table(results)
+    assert "| maze | random pairs | dqn | 1 | 0.500 | 0.700 | -0.200 |" in " ".join(table.split())
+    arena = dataclasses.replace(ARENAS["quick"], primary=("maze",))
+    decided = decision(scores, arena)
+    assert decided is not None
+    assert decided["difference"] == pytest.approx(0.05)
+    assert decided["verdict"] == "undecided"
+    assert decision({"sqn": scores["sqn"]}, arena) is None
+    others = [entry for entry in results if entry["difference"] is not None]
+    figure = figures.paired_differences(others, title="differences")
+    panel = figure.axes[0]
+    assert panel.get_title() == "maze, random pairs"
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["dqn (1)", "r2d2 (2)"]
+    drawn = [line.get_xdata()[0] for line in panel.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(drawn, [-0.2, -0.05], atol=1e-9)
+
+
+def test_the_power_is_that_of_tables_and_of_simulated_seeds() -> None:
+    # Cohen 1988: a paired t-test at 5 % with n = 10 and d = 1 has a power of 0.80.
+    assert power(0.03, 0.03, 10) == pytest.approx(0.803, abs=0.002)
+    assert power(0.0, 0.03, 10) == pytest.approx(0.05)
+    simulated = np.random.default_rng(0).normal(0.02, 0.02, (20_000, 6))
+    rate = (stats.ttest_1samp(simulated, 0, axis=1).pvalue < 0.05).mean()
+    assert power(0.02, 0.02, 6) == pytest.approx(rate, abs=0.01)
+
+
+def test_runs_trained_alike_are_paired() -> None:
+    same = {"file": "a", "episodes": 9, "advantage_learning": 0.0}
+    runs = [
+        {**same, "algo": "sqn", "seed": 0, "spl": 0.7},
+        {**same, "algo": "r2d2", "seed": 0, "spl": 0.6},
+        {**same, "algo": "dqn", "seed": 0, "spl": 0.1},
+        {**same, "algo": "sqn", "seed": 1, "spl": 0.9},
+        {**same, "algo": "r2d2", "seed": 1, "spl": 0.8, "episodes": 5},
+    ]
+    assert paired_differences(runs) == pytest.approx([0.1])
+    on_record = paired_differences(runs_on_record())
+    assert len(on_record) == 6  # Five seeds of an earlier `quick`, and one of today's.
+    assert min(on_record) > 0
