@@ -353,7 +353,7 @@ def main() -> None:
     if not trained:
         raise ValueError("no run is trained, expected a larger --budget-minutes")
     print(write_results(options.arena, trained, out))
-    print(f"wrote ablations.json, ablations.md, learning_curves.png and differences.png to {out}")
+    print(f"wrote ablations.json, ablations.md and figures to {out}")
 
 
 if __name__ == "__main__":
