@@ -52,7 +52,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "sqn_3": {"network.num_skills": 3},
     "sqn_4": {"network.num_skills": 4},
     "equal": {"network.gate": "equal"},
-    "no_embeddings": {"network.module_embeddings": False},
+    "no_embeddings": {"network.embeddings": False},
     "temperature": {"network.gate_temperature": 0.5},
     "reachable": {"network.gate": "reachable"},
     "each_skill": {"learner.skill_loss": "each"},

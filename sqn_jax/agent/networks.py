@@ -158,7 +158,7 @@ class SkillQNetwork(nn.Module):
 
     def _embedded(self, perception: Array, name: str) -> Array:
         """The perception [T, B, H] plus the learnable embedding e_mod of a module."""
-        if not self.config.module_embeddings:
+        if not self.config.embeddings:
             return perception
         # Small, so as not to drown z.
         initializer, shape = nn.initializers.normal(0.02), (self.config.hidden_size,)

@@ -150,7 +150,7 @@ class NetworkConfig:
     gate_balance_rate: float = 0.0
     """learned gate: step by which a bias on the logit of each skill moves after an update, up for a
     skill with less than its equal part of the weight and else down; 0: no bias."""
-    module_embeddings: bool = True
+    embeddings: bool = True
     """sqn: the skill decision and each skill add an embedding of their own to the perception."""
     r2d2_width_factor: int = 1
     """r2d2: how much wider the hidden layer of the head is; 3 is as wide as those of two skills and

@@ -111,7 +111,7 @@ def single_head(policy: Policy, skill: int = 0) -> Policy:
         head = modules[f"skill_{skill}"]
         hidden = head["hidden"]
         bias = hidden["bias"]
-        if policy.config.network.module_embeddings:
+        if policy.config.network.embeddings:
             bias = bias + modules[f"skill_{skill}_embedding"] @ hidden["kernel"]
         selected = {name: modules[name] for name in ("features", "perception")}
         selected["skill_0"] = {**head, "hidden": {**hidden, "bias": bias}}

@@ -91,7 +91,7 @@ def gate_by_hand(tree: Any, perception: Any, obs: Any, config: NetworkConfig) ->
     [
         {"gate": "equal", "num_skills": 3},
         {"gate": "reachable"},
-        {"gate_temperature": 0.3, "module_embeddings": False},
+        {"gate_temperature": 0.3, "embeddings": False},
         {"gate_balance_rate": 0.1, "gate_temperature": 2.0},
     ],
     ids=str,
@@ -107,7 +107,7 @@ def test_a_network_has_the_gate_that_its_settings_name(changes: Any) -> None:
     tree = in_float64(params)["params"]
     assert ("decision" in tree) == (config.gate == "learned")
     assert ("decision_balance" in tree) == (config.gate_balance_rate > 0)
-    assert any("embedding" in name for name in tree) == config.module_embeddings
+    assert any("embedding" in name for name in tree) == config.embeddings
 
     # What the GRU says, step by step, from the oracle.
     perception = []

@@ -362,7 +362,7 @@ def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> Non
     refused = {
         NetworkConfig: {
             **{"cell": "refined_gru", "motion_inputs": True, "gate": "equal"},
-            **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "module_embeddings": False},
+            **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "embeddings": False},
             "r2d2_width_factor": 3,
         },
         EnvConfig: {"goal_distance_encoding": "rational", "goal_distance_scale": 7.0},

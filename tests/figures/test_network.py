@@ -25,7 +25,7 @@ NETWORKS = {
     "last motion": replace(QUICK, network=replace(QUICK.network, motion_inputs=True)),
     "equal weights": replace(QUICK, network=replace(QUICK.network, gate="equal")),
     "balanced": replace(QUICK, network=replace(QUICK.network, gate_balance_rate=0.1)),
-    "no embeddings": replace(QUICK, network=replace(QUICK.network, module_embeddings=False)),
+    "no embeddings": replace(QUICK, network=replace(QUICK.network, embeddings=False)),
 }
 
 
