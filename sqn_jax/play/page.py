@@ -9,6 +9,7 @@ import math
 import re
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -40,10 +41,16 @@ class PlayTask:
 
 
 def maps_of_page(first: OccupancyMap, robot_radius: float) -> list[OccupancyMap]:
-    """The maps that one can choose on a page: one of the user's, then the project's own."""
-    own = {name: load_map(name, robot_radius=robot_radius) for name in known_maps()}
-    own.pop(first.name, None)
-    return [first, *own.values()]
+    """The maps that one can choose on a page: one of the user's, then the project's own.
+
+    Those of the project in which a robot of this size finds no way are left out.
+    """
+    maps = [first]
+    for name in known_maps():
+        if name != first.name:
+            with suppress(ValueError):
+                maps.append(load_map(name, robot_radius=robot_radius))
+    return maps
 
 
 def play_page(

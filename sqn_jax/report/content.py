@@ -40,6 +40,8 @@ class Run:
     """The rows of its metrics.jsonl; none for a shipped policy."""
     summary: dict[str, Any]
     """Its summary.json; empty if there is none."""
+    source: str = ""
+    """What a command takes to find it: the name that the user gave."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,9 @@ def read_runs(
 def _read_run(name: str, checkpoint: int | str, params: WhichParams) -> Run:
     policy = find_policy(name, checkpoint, params)
     if not names_a_run(name):
-        return Run(name, policy, [], {})
+        return Run(name, policy, [], {}, name)
     folder, _ = RunFolder.open(Path(name))
-    return Run(policy.name, policy, folder.read_metrics(), folder.read_summary())
+    return Run(policy.name, policy, folder.read_metrics(), folder.read_summary(), name)
 
 
 def gather_content(

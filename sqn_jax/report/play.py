@@ -50,7 +50,8 @@ def worst_to_play(content: Content, file_name: str) -> Playable:
         if is_mine:
             occupancy_map = worst.batch.world.occupancy_map
             maps.setdefault(occupancy_map.name, occupancy_map)
-    source = next(run.name for run in content.runs if run.policy.name == policy.name)
+    (run, *_) = (run for run in content.runs if run.policy.name == policy.name)
+    source = run.source or run.name
     html = play_page(policy, list(maps.values()), source=source, task=_task_of(first))
     links = [
         _link(worst, file_name) if is_mine else None

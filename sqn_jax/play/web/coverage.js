@@ -11,6 +11,8 @@
 export const LATTICE_ANGLE = Math.atan((Math.sqrt(5) - 1) / 2);
 const LATTICE_COSINE = Math.cos(LATTICE_ANGLE);
 const LATTICE_SINE = Math.sin(LATTICE_ANGLE);
+/** Points of a lattice: those of a map of 500 x 500 m, or of one that is very long. */
+const MOST_POINTS = 2 ** 22;
 
 export class Coverage {
   /**
@@ -36,6 +38,9 @@ export class Coverage {
     this.columns = Math.ceil(Math.max(...us)) - this.left + 1;
     /** @type {number} rows */
     this.rows = Math.ceil(Math.max(...vs)) - this.bottom + 1;
+    if (this.columns * this.rows > MOST_POINTS) {
+      throw new RangeError(`A map of ${width.toFixed()} x ${height.toFixed()} m is too large for this page.`);
+    }
     /** @type {Uint8Array} 1 for the points seen, `row * columns + column` */
     this.seen = new Uint8Array(this.columns * this.rows);
     /** @type {number[]} indices of the points that the last scan saw first */

@@ -176,7 +176,8 @@ class Page {
   }
 
   drawPanels() {
-    const { episode, manualEpisode, hasManual, path } = this.world;
+    const { episode, manualEpisode, hasManual, path, isOver, stepsAtEnd } = this.world;
+    const shortest = isOver ? stepsAtEnd : path?.steps;
     const { decision, moments } = episode;
     this.bars.show(decision);
     this.showWeights(decision?.weights ?? null);
@@ -185,7 +186,7 @@ class Page {
     drawRewards(byId('rewards'), moments);
     const row = ({ env, outcome }) => [
       String(env.steps),
-      outcome === 'reached' && path ? (env.steps / path.steps).toFixed(2) : '–',
+      outcome === 'reached' && shortest ? (env.steps / shortest).toFixed(2) : '–',
       OUTCOMES[outcome],
     ];
     fillRow('score-policy', row(episode));
@@ -244,8 +245,8 @@ class Page {
   async load(input) {
     const [file] = input.files;
     if (!file) return;
+    input.value = ''; // The same file can be chosen again, once it is repaired.
     const image = await readImage(file);
-    input.value = '';
     byId('load-size').textContent = `${image.width} x ${image.height} pixels.`;
     const dialog = byId('load-dialog');
     dialog.returnValue = '';

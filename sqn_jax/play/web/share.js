@@ -9,7 +9,7 @@ const MOST_CELLS = 2 ** 21;
 const SIZES = [0.01, 1]; // m per cell
 const FREE_GRAY = 254;
 const FREE_BELOW = 0.196; // Occupancy, as map_server reads an image by default.
-const NAME = /^[A-Za-z0-9_-]{1,40}$/;
+const NAME = /^[A-Za-z0-9_][A-Za-z0-9_-]{0,39}$/;
 
 /**
  * The text after the # for a map and a task.
@@ -160,7 +160,7 @@ export async function toPng(grid) {
  * @returns {string} one that is safe in a file's name and in a command
  */
 export function fileName(name) {
-  const plain = name.trim().replace(/[^A-Za-z0-9_-]+/g, '_').slice(0, 40);
+  const plain = name.trim().replace(/[^A-Za-z0-9_-]+/g, '_').replace(/^-+/, '').slice(0, 40);
   return NAME.test(plain) ? plain : 'my_map';
 }
 

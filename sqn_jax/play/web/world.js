@@ -74,13 +74,13 @@ export class World {
     const isUsable = task && isFree(task.start) && isFree(task.goal);
     const first = isUsable ? task : randomTask(grid, blocked, points, this.random);
     if (!first) throw new RangeError('No room for the robot on this map.');
-    Object.assign(this, { grid, label, mapName, points });
+    const { policy } = this.data;
+    const episodes = [0, 1].map(() => new Episode(policy, grid, new Random(this.random.bits())));
+    Object.assign(this, { grid, label, mapName, points, episodes });
     this.maxSteps = this.settings.max_steps || steps;
     this.undoable = [];
     this.stroke = null;
     this.wallsHaveChanged = false;
-    const { policy } = this.data;
-    this.episodes = [0, 1].map(() => new Episode(policy, grid, new Random(this.random.bits())));
     [this.episode, this.manualEpisode] = this.episodes;
     this.events.onGrid(true);
     this.events.onName();
@@ -182,6 +182,8 @@ export class World {
     this.events.onScan();
     if (this.isOver) {
       if (this.path === undefined) this.searchPath();
+      /** @type {number | undefined} steps of the shortest path among the walls of the episode */
+      this.stepsAtEnd = this.path?.steps;
       this.events.say(this.verdict());
     }
     return true;
