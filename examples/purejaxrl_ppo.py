@@ -184,7 +184,7 @@ def make_train(options: argparse.Namespace) -> Callable[[Array], tuple[Array, Ar
         network_key, env_key, key = jax.random.split(key, 3)
         keys = jax.random.split(env_key, options.num_envs)
         obs, env_state = jax.vmap(env.reset, (0, None))(keys, env.default_params)
-        gradient_steps = num_updates * EPOCHS * MINIBATCHES
+        gradient_steps = per_point * options.eval_points * EPOCHS * MINIBATCHES
         schedule = optax.linear_schedule(LEARNING_RATE, 0.0, gradient_steps)
         optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
         learner = TrainState.create(
@@ -210,6 +210,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the curve here, as JSON")
     options = parser.parse_args()
+    for name, value in vars(options).items():
+        if isinstance(value, int) and name != "seed" and value < 1:
+            option = name.replace("_", "-")
+            parser.exit(2, f"purejaxrl_ppo: --{option} is {value}, expected 1 or more\n")
+    if options.out is not None and not options.out.absolute().parent.is_dir():
+        parser.exit(2, f"purejaxrl_ppo: --out {options.out}: there is no such folder\n")
     try:
         train = make_train(options)
     except ValueError as error:
@@ -219,9 +225,9 @@ def main() -> None:
     started = time.perf_counter()
     successes, rewards = jax.device_get(compiled(key))
     seconds = time.perf_counter() - started
-    rows = []
+    rows, per_update = [], options.num_envs * options.rollout_steps
     for point, (success, reward) in enumerate(zip(successes, rewards, strict=True)):
-        steps = options.steps * point // options.eval_points
+        steps = point * (options.steps // per_update // options.eval_points) * per_update
         row = {"episodes": steps / options.max_steps, "env_steps": steps}
         rows.append(row | {"eval_success": float(success), "eval_mean_reward": float(reward)})
         print(f"{steps:>9,} steps  success {success:.2f}  reward {reward:.3f}")

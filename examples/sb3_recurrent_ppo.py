@@ -131,6 +131,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the curve here, as JSON")
     options = parser.parse_args()
+    for name, value in vars(options).items():
+        if isinstance(value, int) and name != "seed" and value < 1:
+            option = name.replace("_", "-")
+            parser.exit(2, f"sb3_recurrent_ppo: --{option} is {value}, expected 1 or more\n")
+    if options.out is not None and not options.out.absolute().parent.is_dir():
+        parser.exit(2, f"sb3_recurrent_ppo: --out {options.out}: there is no such folder\n")
     try:
         rows = train(options)
     except ValueError as error:

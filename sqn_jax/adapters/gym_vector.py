@@ -60,7 +60,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def __init__(
         self,
         map: str | Path | OccupancyMap,
-        num_envs: int = 1,
+        num_envs: int | np.integer[Any] = 1,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         arrays: Literal["numpy", "jax"] = "numpy",
@@ -85,6 +85,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         Raises:
             ValueError: the map is unusable, or an argument is unknown or out of its range.
         """
+        if isinstance(num_envs, np.integer):
+            num_envs = int(num_envs)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs is {num_envs!r:.80}, expected a whole number from 1 on")
         if arrays not in ("numpy", "jax"):
@@ -116,7 +118,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def reset(  # type: ignore[override]
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | np.integer[Any] | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, Infos]:
         """Begin an episode in all envs, or in those that `options["reset_mask"]` [N] selects.
@@ -125,6 +127,10 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             seed: that of env 0, the others count up from it; or one for each env; None: go on.
             options: `reset_mask`, bool [N].
         """
+        if isinstance(seed, np.integer):
+            seed = int(seed)
+        if not (seed is None or isinstance(seed, int | Sequence)):
+            raise ValueError(f"seed is {seed!r:.80}, expected a whole number, or one for each env")
         super().reset(seed=seed if isinstance(seed, int) else None)
         refuse_options(options, "reset_mask")
         keys = self._keys(seed)

@@ -60,6 +60,8 @@ class Box:
 
     def contains(self, x: Any) -> Array:
         """bool: whether an array is one of them."""
+        if jnp.shape(x) != self.shape:
+            return jnp.bool_(False)
         low, high = jnp.asarray(self.low, self.dtype), jnp.asarray(self.high, self.dtype)
         return jnp.all((jnp.asarray(x) >= low) & (jnp.asarray(x) <= high))
 
@@ -179,3 +181,7 @@ class LegacyNavigation(Navigation):
         """Observation, state, reward, done and info; see `Navigation.step`."""
         obs, state, reward, terminated, truncated, info = super().step(key, state, action, params)
         return obs, state, reward, terminated | truncated, info
+
+    def is_terminal(self, state: EnvState, params: EnvParams | None = None) -> Array:
+        """bool: whether the episode is over, which here is the time limit alone."""
+        return self.is_truncated(state, params)

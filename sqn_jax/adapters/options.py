@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from sqn_jax.config import EnvConfig
 from sqn_jax.config.files import from_dict
 from sqn_jax.env import EnvParams, make_env
@@ -35,7 +37,13 @@ def make_world(
             nearest = difflib.get_close_matches(name, names, 1)
             hint = f"{nearest[0]}?" if nearest else f"one of {', '.join(['map', 'spawn', *names])}"
             raise ValueError(f"unknown option {name!r:.80}, expected {hint}")
-    config = from_dict(dict(settings), EnvConfig, "env.")
+    numbers = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in settings.items()
+    }
+    config = from_dict(numbers, EnvConfig, "env.")
+    if not isinstance(map_name, str | Path | OccupancyMap):
+        raise ValueError(f"map is {map_name!r:.80}, expected a name, a path or an OccupancyMap")
     if not isinstance(map_name, OccupancyMap):
         map_name = load_map(map_name, robot_radius=config.robot_radius)
     return map_name, make_env(map_name, config, spawn=spawn)

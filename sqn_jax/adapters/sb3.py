@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sqn_jax.adapters.gym import refuse_options
 from sqn_jax.adapters.gym_vector import NavigationVectorEnv
 from sqn_jax.maps import OccupancyMap
 
@@ -55,6 +56,8 @@ class NavigationVecEnv(VecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in all envs, with the seeds of `seed` if it was called."""
+        for options in self._options:
+            refuse_options(options)
         obs, _ = self.envs.reset(seed=None if self._seeds[0] is None else self._seeds)
         self._reached[:] = False
         self._reset_seeds()

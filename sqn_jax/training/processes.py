@@ -46,7 +46,7 @@ class ProcessLost(OSError):
     def __init__(self) -> None:
         super().__init__(
             "another process of this run has ended or cannot be reached, so this one ends, too; "
-            "what was saved is on the disk: start all of them again with --resume"
+            "what was saved, if anything, is on the disk: start all of them again with --resume"
         )
 
 
@@ -71,8 +71,10 @@ class Cluster:
     """Seconds to wait for all to come."""
 
     def __post_init__(self) -> None:
-        if self.timeout < 1:
-            raise ValueError(f"--process-timeout is {self.timeout}, expected 1 or more seconds")
+        if not 1 <= self.timeout <= LONGEST_WAIT_SECONDS:
+            raise ValueError(
+                f"--process-timeout is {self.timeout}, expected 1 to {LONGEST_WAIT_SECONDS} seconds"
+            )
         if self.coordinator is None:
             return
         host, _, port = self.coordinator.rpartition(":")

@@ -118,6 +118,9 @@ def test_settings_are_given_by_keyword(room: OccupancyMap) -> None:
     ).unwrapped
     assert env.observation_space.shape == (9 + 3,)
     assert env.env_params.max_steps == 2
+    # As a sweep has them.
+    swept = NavigationEnv(room, max_steps=np.int64(3), range_noise=np.float32(0.5)).env_params
+    assert (swept.max_steps, swept.config.range_noise) == (3, 0.5)
     assert NavigationEnv(room, time_step=0.2).metadata["render_fps"] == 5
     points = NavigationEnv(room, spawn="evaluation").env_params.spawn_positions
     assert_same(points[:, 0], room.evaluation_points.astype(np.float32))
@@ -133,6 +136,7 @@ def test_settings_are_given_by_keyword(room: OccupancyMap) -> None:
         ({"spawn": "here"}, "spawn is 'here', expected training or evaluation"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi', expected human or rgb_array"),
         ({"map": "nowhere"}, "unknown map 'nowhere'"),
+        ({"map": 3}, "map is 3, expected a name, a path or an OccupancyMap"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_a_line(

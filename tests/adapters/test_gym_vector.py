@@ -194,6 +194,9 @@ def test_actions_seeds_and_masks_that_cannot_be_are_refused(room: OccupancyMap) 
         with pytest.raises(gymnasium.error.InvalidAction, match=r"expected whole numbers of sha"):
             envs.step(wrong)
     assert "seed has 2 entries, expected 3" in refusal(lambda: envs.reset(seed=[1, 2]))
+    assert "seed is 1.5, expected a whole number" in refusal(lambda: envs.reset(seed=1.5))
+    first, again = (envs.reset(seed=seed)[0] for seed in (7, np.int64(7)))
+    np.testing.assert_array_equal(first, again)
     assert "expected reset_mask" in refusal(lambda: envs.reset(options={"mask": 1}))
     for mask in (ONE_OF_THREE[:2], ONE_OF_THREE & False, [True] * 3, ONE_OF_THREE.astype(int)):
         said = refusal(lambda mask=mask: envs.reset(options={"reset_mask": mask}))

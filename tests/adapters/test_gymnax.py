@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -138,3 +139,14 @@ def test_spaces_hold_what_they_draw(env: Navigation) -> None:
 
 def test_what_cannot_be_used_is_refused_in_a_line(room: OccupancyMap) -> None:
     assert refusal(lambda: Navigation(room, beams=3)).startswith("unknown option 'beams'")
+
+
+def test_spaces_look_at_shapes_and_old_code_finds_its_names(room: OccupancyMap) -> None:
+    env = LegacyNavigation(room, max_steps=2)
+    space = env.observation_space()
+    assert space.contains(jnp.full(space.shape, 0.5))
+    assert not space.contains(jnp.full(3, 0.5))
+    _, state = env.reset(jax.random.key(0))
+    for step, is_over in ((0, False), (1, False), (2, True)):
+        there = dataclasses.replace(state, step=jnp.int32(step))
+        assert bool(env.is_terminal(there)) is is_over

@@ -284,6 +284,7 @@ def squeezed(data: bytes) -> str:
         # Packed well, and not for the map that it says it is.
         (f"#size=80,80&resolution=0.05&cells={squeezed(bytes(799))}", "damaged"),
         (f"#size=80,80&resolution=0.05&cells={squeezed(bytes(10**8))}", "damaged"),
+        (f"#size=8,40000&resolution=1&cells={squeezed(bytes(40_000))}", "too large"),
     ],
 )
 def test_a_damaged_link_is_named_and_the_page_goes_on(

@@ -160,3 +160,11 @@ for (const kind of MAP_KINDS) {
     assert.equal(seen.size, 4);
   });
 }
+
+test('a map for which the lattice would be too large is refused', () => {
+  const settings = { coverage_cell: 0.325, max_range: 5, field_of_view_deg: 350 };
+  assert.equal(new Coverage(51, 51, settings).count, 0);
+  for (const [width, height] of [[8, 40000], [40000, 8], [900, 900]]) {
+    assert.throws(() => new Coverage(width, height, settings), /too large for this page/);
+  }
+});

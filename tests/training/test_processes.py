@@ -35,7 +35,7 @@ AT_HOME = {"coordinator": "node1:1234", "num_processes": 3, "process_id": 1}
         ({"num_processes": 0}, "--num-processes is 0, expected 1 or more"),
         ({"process_id": 3}, "--process-id is 3, expected 0 to 2"),
         ({"process_id": -1}, "--process-id is -1, expected 0 to 2"),
-        ({"timeout": 0}, "--process-timeout is 0, expected 1 or more seconds"),
+        ({"timeout": 0}, "--process-timeout is 0, expected 1 to 86400 seconds"),
     ],
 )
 def test_processes_that_make_no_sense_are_refused(changes: dict[str, Any], words: str) -> None:
