@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
 from sqn_jax.export import sqn_policy
-from sqn_jax.export.description import describe_robot, require_exportable
+from sqn_jax.export.description import (
+    describe_robot,
+    observation_size,
+    require_exportable,
+    state_size,
+)
 from sqn_jax.export.folder import (
     CONFIG,
     FILES,
@@ -42,7 +47,7 @@ TOLERANCE = 1e-4
 MAX_FILE_BYTES = 2**30
 
 Step = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[Any], NDArray[Any]]]
-"""Of an observation [R + 2] and a hidden state [H]: Q-values [A] and the next hidden state."""
+"""Of an observation and a hidden state, both [N]: Q-values [A] and the next hidden state."""
 
 
 @dataclass(frozen=True)
@@ -176,8 +181,8 @@ def _reference(folder: Path, data: bytes, config: TrainConfig) -> dict[str, NDAr
     """The arrays of reference.npz, of the shapes that the policy's have."""
     actions, skills = 5, config.network.num_skills if config.algo == "sqn" else 1
     expected = {
-        "observations": ((NUM_STEPS, config.env.num_beams + 2), "f"),
-        "hidden": ((NUM_STEPS + 1, config.network.hidden_size), "f"),
+        "observations": ((NUM_STEPS, observation_size(config)), "f"),
+        "hidden": ((NUM_STEPS + 1, state_size(config)), "f"),
         "q_values": ((NUM_STEPS, actions), "f"),
         "skill_weights": ((NUM_STEPS, skills), "f"),
         "actions": ((NUM_STEPS,), "i"),

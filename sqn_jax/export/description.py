@@ -18,11 +18,14 @@ from sqn_jax.policies.run_policies import Policy
 BEAM_ORDER = "from right to left; 0 is straight ahead, positive to the left"
 
 KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
-    NetworkConfig: frozenset({"hidden_size", "num_skills", "layer_norm", "dqn_width_factor"}),
+    NetworkConfig: frozenset(
+        {"hidden_size", "num_skills", "layer_norm", "dqn_width_factor", "motion_inputs"}
+    ),
     EnvConfig: frozenset(
         {
             # What the graph and `sqn_policy.py` act on.
             *("num_beams", "field_of_view_deg", "max_range", "max_goal_distance"),
+            *("goal_distance_encoding", "goal_distance_scale"),
             *("heading_encoding", "forward_speed", "backward_speed", "turn_rate", "time_step"),
             # What a policy in use has nothing to do with, or is only described.
             *("robot_radius", "goal_radius", "max_steps", "coverage_cell", "ray_sectors"),
@@ -34,7 +37,11 @@ KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
 }
 """The settings of which an export knows what they mean; others may only have their default."""
 
-KNOWN_CHOICES = {"algo": ("sqn", "r2d2", "dqn"), "env.heading_encoding": ("linear", "sincos")}
+KNOWN_CHOICES = {
+    "algo": ("sqn", "r2d2", "dqn"),
+    "env.goal_distance_encoding": ("clipped", "rational"),
+    "env.heading_encoding": ("linear", "sincos"),
+}
 
 
 def require_exportable(
@@ -73,6 +80,16 @@ def require_exportable(
             )
 
 
+def observation_size(config: TrainConfig) -> int:
+    """Numbers a policy is given each step: ranges, the goal's two, and if the move was refused."""
+    return config.env.num_beams + 2 + config.network.motion_inputs
+
+
+def state_size(config: TrainConfig) -> int:
+    """Numbers a policy hands on to the next step: its memory, and with motion inputs the action."""
+    return config.network.hidden_size + len(ACTION_NAMES) * config.network.motion_inputs
+
+
 def describe_robot(config: TrainConfig) -> dict[str, Any]:
     """The robot that a policy is for: what stands in `config.json` and in the ONNX file.
 
@@ -92,8 +109,11 @@ def describe_robot(config: TrainConfig) -> dict[str, Any]:
         "time_step_s": env.time_step,
         "robot_radius_m": env.robot_radius,
         "goal_radius_m": env.goal_radius,
+        "goal_distance_encoding": env.goal_distance_encoding,
         "max_goal_distance_m": env.max_goal_distance,
+        "goal_distance_scale_m": env.goal_distance_scale,
         "heading_encoding": env.heading_encoding,
+        "motion_inputs": config.network.motion_inputs,
     }
 
 

@@ -133,6 +133,8 @@ certified scanner between it and the motors, and people out of reach of both."""
 
 def _robot(config: TrainConfig) -> str:
     env = config.env
+    clipped = env.goal_distance_encoding == "clipped"
+    far = f"up to {env.max_goal_distance:g} m" if clipped else "of any size"
     return f"""## The robot it is for
 
 | What | Trained with |
@@ -144,7 +146,7 @@ def _robot(config: TrainConfig) -> str:
 {math.degrees(env.turn_rate * env.time_step):.3g} degrees |
 | Ranges | {env.num_beams} directions over {env.field_of_view_deg:g} degrees, up to \
 {env.max_range:g} m, measured from the center of the body |
-| Goal | distance up to {env.max_goal_distance:g} m and heading, known at each step; reached \
+| Goal | distance {far} and heading, known at each step; reached \
 within {env.goal_radius:g} m |
 
 A slower robot takes the same path if each command is held for longer: a tenth of the speeds for ten

@@ -18,7 +18,11 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.env.navigation import BACKWARD, FORWARD
 from sqn_jax.env.prepare import commands_of
+from sqn_jax.export.description import observation_size, state_size
+
+MOVES = (FORWARD, BACKWARD)
 
 OPSET = 17
 IR_VERSION = 8
@@ -77,9 +81,11 @@ def policy_graph(
     """The graph of a policy.
 
     Inputs: `obs` [1, R + 2]: R ranges in m from right to left, the goal's distance in m and its
-    heading in rad; `h_in` [1, 1, H], zeros at the start and at each new goal.
+    heading in rad; `h_in` [1, 1, H], zeros at the start and at each new goal. With
+    `network.motion_inputs` `obs` has one column more, 1 where the last command was a move and the
+    robot did not move, else 0; and the last action, one-hot, follows the H numbers of `h_in`.
     Outputs: `actions` [1, 2] m/s and rad/s, `action_index` [1], `q_values` [1, A], `skill_weights`
-    [1, K], `h_out` [1, 1, H].
+    [1, K], `h_out` as `h_in`.
 
     Args:
         config: of the policy; `require_exportable` must hold.
@@ -92,27 +98,35 @@ def policy_graph(
     env, network = config.env, config.network
     graph = _Graph(arrays)
     size, num_actions = network.hidden_size, len(commands_of(env))
-    features = _features(graph, *_observation(graph, env))
-    carry = graph.node("Reshape", "h_in", graph.constant([1, size], np.int64))
+    memory = graph.node("Reshape", "h_in", graph.constant([1, -1], np.int64))
+    carry = _columns(graph, memory, 0, size)
+    motion = _motion(graph, memory, config) if network.motion_inputs else []
+    features = _features(graph, *_observation(graph, env), motion)
     carry, perception = _perception(graph, config.algo, features, carry)
     skill_weights, q_values = _heads(graph, config.algo, network, perception)
     graph.node("Identity", skill_weights, output="skill_weights")
     graph.node("Identity", q_values, output="q_values")
-    after = graph.node("Reshape", carry, graph.constant([1, 1, size], np.int64))
-    # A goal that is unknown for once must not erase what the policy has seen.
-    graph.node("Where", graph.node("IsNaN", after), "h_in", after, output="h_out")
     graph.node("ArgMax", "q_values", output="action_index", axis=1, keepdims=0)
+    if network.motion_inputs:
+        one_hot = graph.constant(np.eye(num_actions))
+        carry = graph.node(
+            "Concat", carry, graph.node("Gather", one_hot, "action_index", axis=0), axis=1
+        )
+    after = graph.node("Reshape", carry, graph.constant([1, 1, -1], np.int64))
+    # A goal that is unknown for once must not erase what the policy has seen.
+    unknown = graph.node("IsNaN", _columns(graph, "q_values", 0, 1))
+    graph.node("Where", unknown, "h_in", after, output="h_out")
     commands = graph.constant(commands_of(env))
     graph.node("Gather", commands, "action_index", output="actions", axis=0)
     graph.require_all_used()
 
     num_skills = network.num_skills if config.algo == "sqn" else 1
-    hidden = ("float32", [1, 1, size])
+    hidden = ("float32", [1, 1, state_size(config)])
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             "sqn_jax_policy",
-            _values({"obs": ("float32", [1, env.num_beams + 2]), "h_in": hidden}),
+            _values({"obs": ("float32", [1, observation_size(config)]), "h_in": hidden}),
             _values(
                 {
                     "actions": ("float32", [1, 2]),
@@ -147,15 +161,19 @@ def _values(shapes: Mapping[str, tuple[str, list[int]]]) -> list[onnx.ValueInfoP
 def _observation(graph: _Graph, env: EnvConfig) -> tuple[str, str]:
     """The ranges [1, R] and the goal [1, G] as the network sees them, in 0..1: `env.observe`."""
     zero, one = graph.constant(0.0), graph.constant(1.0)
-    readings = _columns(graph, 0, env.num_beams)
+    readings = _columns(graph, "obs", 0, env.num_beams)
     far = graph.constant(env.max_range)
     is_nan = graph.node("IsNaN", readings)  # Infinity is clipped.
     seen = graph.node("Where", is_nan, far, readings)
     ranges = graph.node("Clip", graph.node("Div", seen, far), zero, one)
-    distance = _columns(graph, env.num_beams, env.num_beams + 1)
-    scaled = graph.node("Div", distance, graph.constant(env.max_goal_distance))
-    parts = [graph.node("Clip", scaled, zero, one)]
-    heading = _columns(graph, env.num_beams + 1, env.num_beams + 2)
+    distance = _columns(graph, "obs", env.num_beams, env.num_beams + 1)
+    if env.goal_distance_encoding == "clipped":
+        scaled = graph.node("Div", distance, graph.constant(env.max_goal_distance))
+        parts = [graph.node("Clip", scaled, zero, one)]
+    else:
+        further = graph.node("Add", distance, graph.constant(env.goal_distance_scale))
+        parts = [graph.node("Div", distance, further)]
+    heading = _columns(graph, "obs", env.num_beams + 1, env.num_beams + 2)
     if env.heading_encoding == "linear":
         parts.append(_turns(graph, heading))
     else:
@@ -166,10 +184,19 @@ def _observation(graph: _Graph, env: EnvConfig) -> tuple[str, str]:
     return ranges, graph.node("Concat", *parts, axis=1)
 
 
-def _columns(graph: _Graph, first: int, last: int) -> str:
-    """Columns of the input `obs`."""
+def _columns(graph: _Graph, value: str, first: int, last: int) -> str:
+    """Columns `first` to `last` - 1 of [1, N]."""
     ends = [graph.constant([number], np.int64) for number in (first, last, 1)]
-    return graph.node("Slice", "obs", *ends)
+    return graph.node("Slice", value, *ends)
+
+
+def _motion(graph: _Graph, memory: str, config: TrainConfig) -> list[str]:
+    """The last action [1, A], and whether it was a move that was refused [1, 1]."""
+    size, beams = config.network.hidden_size, config.env.num_beams
+    last = _columns(graph, memory, size, state_size(config))
+    moves = [_columns(graph, memory, size + action, size + action + 1) for action in MOVES]
+    refused = _columns(graph, "obs", beams + 2, beams + 3)
+    return [last, graph.node("Mul", refused, graph.node("Add", *moves))]
 
 
 def _turns(graph: _Graph, heading: str) -> str:
@@ -185,13 +212,13 @@ def _turns(graph: _Graph, heading: str) -> str:
     return graph.node("Where", graph.node("Greater", away, half), folded, turns)
 
 
-def _features(graph: _Graph, ranges: str, goal: str) -> str:
-    """Paper eq. 1, [1, 2 H]."""
+def _features(graph: _Graph, ranges: str, goal: str, motion: list[str]) -> str:
+    """Paper eq. 1, [1, 2 H], and what the robot knows of its last step."""
     both = [
         _mlp(graph, f"params/features/{name}", value)
         for name, value in (("ranges", ranges), ("goal", goal))
     ]
-    return graph.node("Concat", *both, axis=1)
+    return graph.node("Concat", *both, *motion, axis=1)
 
 
 def _perception(graph: _Graph, algo: str, features: str, carry: str) -> tuple[str, str]:

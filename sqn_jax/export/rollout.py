@@ -15,7 +15,7 @@ from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, EnvState, Observation, make_env, reset, step
 from sqn_jax.env.geometry import decode_goal
-from sqn_jax.policies.greedy import GreedyPolicy, step_network
+from sqn_jax.policies.greedy import GreedyPolicy, step_policy
 from sqn_jax.training.state import network_of
 
 NUM_STEPS = 400
@@ -30,8 +30,9 @@ def reference_rollout(policy: GreedyPolicy, map_name: str) -> dict[str, NDArray[
         map_name: where.
 
     Returns:
-        `observations` [T, R + 2] in SI units, infinite where a beam hits nothing; `hidden`
-        [T + 1, H] before each step and after the last; `q_values` [T, A]; `skill_weights` [T, K];
+        `observations` [T, R + 2] in SI units, infinite where a beam hits nothing, and with
+        `network.motion_inputs` a column more, whether the step before was refused; `hidden`
+        [T + 1, N] before each step and after the last; `q_values` [T, A]; `skill_weights` [T, K];
         `actions` [T].
 
     Raises:
@@ -43,17 +44,20 @@ def reference_rollout(policy: GreedyPolicy, map_name: str) -> dict[str, NDArray[
     world = make_env(map_name, env, spawn="evaluation")
     key, reset_key = jax.random.split(jax.random.key(SEED))
     obs, state = reset(reset_key, world)
-    observed, carries, q_values, skill_weights = jax.device_get(
+    observed, refused, carries, q_values, skill_weights = jax.device_get(
         _roll(
             jax.random.split(key, NUM_STEPS),
-            (obs, state, policy.start()),
+            (obs, state, np.bool_(False), policy.start()),
             world,
             policy.params,
             network_of(policy.config),
         )
     )
+    observations = in_si_units(observed, env)
+    if policy.config.network.motion_inputs:
+        observations = np.column_stack([observations, refused.astype(np.float32)])
     return {
-        "observations": in_si_units(observed, env),
+        "observations": observations,
         "hidden": np.concatenate([np.asarray(policy.start())[None], carries]),
         "q_values": q_values,
         "skill_weights": skill_weights,
@@ -72,18 +76,20 @@ def in_si_units(obs: Observation, env: EnvConfig) -> NDArray[np.float32]:
 @partial(jax.jit, static_argnames="network")
 def _roll(
     keys: Array,
-    start: tuple[Observation, EnvState, Array],
+    start: tuple[Observation, EnvState, Any, Array],
     world: EnvParams,
     params: Params,
     network: QNetwork,
-) -> tuple[Observation, Array, Array, Array]:
-    """Observations, carries after each step, Q-values and skill weights, [T, ...] each."""
+) -> tuple[Observation, Array, Array, Array, Array]:
+    """Observations, whether the steps before them were refused, carries after each step, Q-values
+    and skill weights, [T, ...] each."""
 
     def advance(before: Any, key: Array) -> Any:
-        obs, state, carry = before
-        carry, output = step_network(params, obs, carry, network)
-        new_obs, state, *_ = step(key, state, output.q_values.argmax(), world)
-        return (new_obs, state, carry), (obs, carry, output.q_values, output.skill_weights)
+        obs, state, refused, carry = before
+        carry, output = step_policy(params, obs, carry, refused, network)
+        new_obs, state, *_, info = step(key, state, output.q_values.argmax(), world)
+        seen = obs, refused, carry, output.q_values, output.skill_weights
+        return (new_obs, state, info["collision"], carry), seen
 
-    rollout: tuple[Observation, Array, Array, Array] = jax.lax.scan(advance, start, keys)[1]
+    rollout: tuple[Observation, Array, Array, Array, Array] = jax.lax.scan(advance, start, keys)[1]
     return rollout

@@ -16,10 +16,7 @@ PREFIX = "params/"
 """What the paths of all arrays begin with."""
 
 BEYOND: dict[str, tuple[object, ...]] = {
-    "network.motion_inputs": (False, True),
     "network.cell": ("gru", "refined_gru"),
-    "env.goal_distance_encoding": ("clipped", "rational"),
-    "env.goal_distance_scale": (),
 }
 """What the page computes beyond what `sqn export` does, see `require_exportable`."""
 

@@ -14,6 +14,7 @@ from sqn_jax.agent.networks import HasObservation, Params, QNetwork, QOutput, in
 from sqn_jax.config import TrainConfig
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import of_seed
+from sqn_jax.training.motion import MOTION_SIZE, with_motion
 from sqn_jax.training.state import network_of
 
 
@@ -33,39 +34,57 @@ class GreedyPolicy:
     params: Params
 
     def start(self) -> Array:
-        """The recurrent state [H] at the start of an episode."""
-        return initial_carry(self.config.network, 1)[0]
+        """The recurrent state at the start of an episode: `act` hands it on.
 
-    def act(self, obs: HasObservation, carry: Array) -> tuple[Array, Array]:
+        [H], or with `network.motion_inputs` [H + A], of which the last A are the last action.
+        """
+        carry = initial_carry(self.config.network, 1)[0]
+        actions = MOTION_SIZE - 1 if self.config.network.motion_inputs else 0
+        return jnp.concatenate([carry, jnp.zeros(actions)])
+
+    def act(
+        self, obs: HasObservation, carry: Array, *, refused: bool | Array = False
+    ) -> tuple[Array, Array]:
         """Choose an action.
 
         Args:
-            obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot; for a policy with
-                `network.motion_inputs` what `training.motion` makes of it.
-            carry: [H] from `start` or the step before.
+            obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot.
+            carry: from `start` or the step before.
+            refused: whether the last move failed, `info["collision"]` of `sqn_jax.step`; only a
+                policy with `network.motion_inputs` looks at it.
 
         Returns:
             The action, 0 to 4, and the next carry.
         """
-        carry, output = self.step(obs, carry)
+        carry, output = self.step(obs, carry, refused=refused)
         return output.q_values.argmax(), carry
 
-    def step(self, obs: HasObservation, carry: Array) -> tuple[Array, QOutput]:
-        """The next carry [H] and all that the network says of an observation, without batch axes.
+    def step(
+        self, obs: HasObservation, carry: Array, *, refused: bool | Array = False
+    ) -> tuple[Array, QOutput]:
+        """The next carry and all that the network says of an observation, without batch axes.
 
-        See `act`.
-
-        Raises:
-            ValueError: the policy looks at its last action, and `obs` does not tell it.
+        See `act`; the action in the carry is that of the largest value.
         """
-        if self.config.network.motion_inputs and not hasattr(obs, "motion"):
-            raise ValueError(
-                f"policy {self.name} has network.motion_inputs, expected a MotionObservation: "
-                "see sqn_jax.training.motion"
-            )
         return cast(
-            tuple[Array, QOutput], step_network(self.params, obs, carry, network_of(self.config))
+            tuple[Array, QOutput],
+            step_policy(self.params, obs, carry, jnp.asarray(refused), network_of(self.config)),
         )
+
+
+@partial(jax.jit, static_argnames="network")
+def step_policy(
+    params: Params, obs: HasObservation, carry: Array, refused: Array, network: QNetwork
+) -> tuple[Array, QOutput]:
+    """One step of a policy for one robot, without axes of time and batch; see `GreedyPolicy`."""
+    size = network.config.hidden_size
+    if not network.config.motion_inputs:
+        return step_network(params, obs, carry, network)
+    carry, output = step_network(
+        params, with_motion(obs, carry[size:], refused), carry[:size], network
+    )
+    taken = jax.nn.one_hot(output.q_values.argmax(), MOTION_SIZE - 1)
+    return jnp.concatenate([carry, taken]), output
 
 
 @partial(jax.jit, static_argnames="network")

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from sqn_jax.agent.networks import HasObservation
 from sqn_jax.config import NetworkConfig
 from sqn_jax.env import NUM_ACTIONS, Observation
 from sqn_jax.env.navigation import BACKWARD, FORWARD
@@ -59,7 +60,17 @@ def next_observation(
     """
     if not isinstance(seen, MotionObservation):
         return obs
-    refused = collisions & ((actions == FORWARD) | (actions == BACKWARD))
-    taken = jax.nn.one_hot(actions, NUM_ACTIONS)
-    motion = jnp.concatenate([taken, refused[..., None].astype(taken.dtype)], axis=-1)
+    return with_motion(obs, jax.nn.one_hot(actions, NUM_ACTIONS), collisions)
+
+
+def with_motion(obs: HasObservation, last: Array, collisions: Array) -> MotionObservation:
+    """An observation with the step before it.
+
+    Args:
+        obs: of the env, [..., R] and [..., G].
+        last: [..., A] the action of that step, one-hot, or zeros before the first.
+        collisions: [...] bool, whether the robot stayed where it was; of moves alone it counts.
+    """
+    refused = collisions * (last[..., FORWARD] + last[..., BACKWARD])
+    motion = jnp.concatenate([last, refused[..., None]], axis=-1)
     return MotionObservation(ranges=obs.ranges, goal=obs.goal, motion=motion)

@@ -153,6 +153,48 @@ def test_a_policy_that_is_not_finite_stops_the_robot_and_a_later_scan_starts_it(
     assert controller.tick(here, 0.05) == Command(0.5, 0.0)
 
 
+class MotionPolicy(MadeUpPolicy):
+    """One that was trained with motion inputs."""
+
+    motion_size = 5
+
+    def act(self, *args: Any, refused: bool) -> Any:  # type: ignore[override]
+        command, hidden = super().act(*args)
+        self.seen[-1] = (*self.seen[-1], refused)  # type: ignore[assignment]
+        return command, hidden
+
+
+def test_a_policy_with_motion_inputs_hears_of_moves_that_moved_nothing() -> None:
+    policy = MotionPolicy()
+    controller = Controller(policy, Limits())
+    controller.set_goal((0.0, 30.0))
+    x = 0.0
+    # m since the decision before, the reading ahead, and what is heard at this decision of 0.5 s.
+    for step, (moved, ahead, refused) in enumerate(
+        [
+            (0.0, 3.0, False),  # Nothing was commanded before the first.
+            (0.25, 3.0, False),
+            (0.02, 3.0, True),  # 0.25 m were commanded.
+            (0.03, 0.5, False),
+            (0.0, 0.5, False),  # A turn is no move.
+            (0.0, 3.0, False),
+        ]
+    ):
+        x += moved
+        controller.set_scan(scan(ahead), Mount(), step / 2)
+        controller.tick(lambda x=x: (x, 0.0, 0.0), step / 2)  # type: ignore[misc]
+        assert policy.seen[step][4] is refused, step  # type: ignore[misc]
+    assert controller.tick(lost, 2.7).reason
+    controller.tick(lambda: (x, 0.0, 0.0), 2.75)
+    assert policy.seen[-1][4] is False, "after a stop nothing is known"  # type: ignore[misc]
+    controller.set_scan(scan(), Mount(), 3.25)
+    controller.tick(lambda: (x, 0.0, 0.0), 3.25)
+    assert policy.seen[-1][4] is True  # type: ignore[misc]
+    controller.set_goal((9.0, 0.0))
+    controller.tick(lambda: (x, 0.0, 0.0), 3.3)
+    assert policy.seen[-1][4] is False  # type: ignore[misc]
+
+
 def test_limits_are_checked() -> None:
     for name, value in (("slowdown", 0.0), ("max_speed", math.inf), ("unseen", math.nan)):
         with pytest.raises(ValueError, match=f"{name} is"):

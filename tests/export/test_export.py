@@ -36,6 +36,7 @@ from sqn_jax.export.model_card import Result, model_card, results_of
 from sqn_jax.export.safetensors_file import from_safetensors, to_safetensors
 from sqn_jax.policies.pretrained import write_policy
 from sqn_jax.policies.run_policies import Policy, of_seed
+from sqn_jax.training.motion import MotionObservation
 from sqn_jax.training.state import network_of, params_shapes
 
 onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")
@@ -49,7 +50,8 @@ ROBOT = {"num_beams": 7, "field_of_view_deg": 270.0, "max_range": 3.0, "max_goal
 
 def tiny(algo: str = "sqn", **changes: Any) -> TrainConfig:
     """A network of 8 units for a robot of 7 beams."""
-    env = EnvConfig(**ROBOT, heading_encoding=changes.pop("heading_encoding", "linear"))
+    names = ("heading_encoding", "goal_distance_encoding", "goal_distance_scale")
+    env = EnvConfig(**ROBOT, **{name: changes.pop(name) for name in names if name in changes})
     return TrainConfig(algo=algo, env=env, network=NetworkConfig(hidden_size=8, **changes))
 
 
@@ -71,6 +73,9 @@ CONFIGS = {
     "r2d2 with norms": tiny("r2d2", layer_norm=True),
     "dqn, sine and cosine": tiny("dqn", heading_encoding="sincos"),
     "dqn with norms": tiny("dqn", layer_norm=True),
+    "sqn without a largest distance": tiny(
+        goal_distance_encoding="rational", goal_distance_scale=3.0
+    ),
 }
 
 
@@ -86,6 +91,8 @@ def test_onnx_and_numpy_say_what_the_network_says(config: TrainConfig, tmp_path:
     readings = np.where(np.isnan(ranges), 3.0, ranges)
     scaled = np.minimum(np.maximum(readings, 0), 3) / 3
     goal = [np.minimum(distances / 10, 1)]
+    if config.env.goal_distance_encoding == "rational":
+        goal = [distances / (distances + 3)]
     if config.env.heading_encoding == "sincos":
         goal += [(np.sin(headings) + 1) / 2, (np.cos(headings) + 1) / 2]
     else:
@@ -133,6 +140,63 @@ def test_onnx_and_numpy_say_what_the_network_says(config: TrainConfig, tmp_path:
     assert command.tolist() == [0, 0]
     np.testing.assert_array_equal(kept, hidden)  # A gap in the localization is no end.
     assert by_numpy.beam_angles.tolist() == describe_robot(config)["beam_angles_rad"]
+
+
+@pytest.mark.parametrize(("algo", "seed"), [("sqn", 2), ("dqn", 1)])
+def test_with_motion_inputs_a_policy_keeps_its_last_action_itself(
+    algo: str, seed: int, tmp_path: Path
+) -> None:
+    policy = random_policy(tiny(algo, motion_inputs=True), seed)
+    smaller = jax.tree.map(lambda x: x / 2, policy.params[0])
+    for name in smaller["params"]:
+        if name in ("skill_0", "skill_1"):  # So that no action is the best one for ever.
+            smaller["params"][name]["output"]["bias"] *= 0
+    policy = dataclasses.replace(policy, params=(smaller,))
+    write_policy(tmp_path, policy, {})
+    by_numpy, by_jax = (
+        sqn_policy.Policy(tmp_path / "tiny.npz"),
+        load_policy(str(tmp_path / "tiny.npz")),
+    )
+    model = policy_graph(policy.config, flat_arrays(policy.params[0]), {})
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    network, rng = network_of(policy.config), np.random.default_rng(3)
+    carry, h_in = initial_carry(policy.config.network, 1), np.zeros((1, 1, 13), np.float32)
+    hidden, state, motion = None, by_jax.start(), np.zeros(6, np.float32)
+    taken: list[tuple[int, bool]] = []
+    with compiling_quickly():
+        for _ in range(60):
+            ranges, distance, heading = rng.uniform(0, 4, 7), rng.uniform(0, 12), rng.uniform(-3, 3)
+            shown = [np.float32([np.minimum(ranges, 3) / 3]), np.float32([[min(distance / 10, 1)]])]
+            shown[1] = np.append(shown[1], [[(heading + np.pi) / (2 * np.pi)]], axis=1)
+            refused = bool(rng.integers(2))
+            if taken:
+                last = taken[-1][0]
+                motion = np.float32([*np.eye(5)[last], refused and last in (1, 2)])
+            seen = MotionObservation(*(np.float32(x)[None] for x in (*shown, motion[None])))
+            carry, output = network.apply(policy.params[0], seen, carry)
+            expected = np.asarray(output.q_values)[0, 0]
+
+            obs = np.float32([*ranges, distance, heading, refused])
+            index, q_values, h_in = session.run(
+                ["action_index", "q_values", "h_out"], {"obs": obs[None], "h_in": h_in}
+            )
+            tolerance = 1e-5 * np.abs(expected).max()
+            np.testing.assert_allclose(q_values[0], expected, atol=tolerance)
+            before = np.zeros(13) if hidden is None else hidden
+            np.testing.assert_allclose(by_numpy.step(obs, before)[0], expected, atol=tolerance)
+            command, hidden = by_numpy.act(ranges, distance, heading, hidden, refused=refused)
+            action, state = by_jax.act(
+                Observation(shown[0][0], np.float32(shown[1][0])), state, refused=refused
+            )
+            assert action == index[0] == expected.argmax()
+            np.testing.assert_array_equal(command, by_numpy.commands[int(action)])
+            for memory in (h_in[0, 0], hidden, state):
+                np.testing.assert_array_equal(memory[8:], np.eye(5)[int(action)])
+            taken.append((int(action), refused))
+    tries = {(action in (1, 2), refused) for action, refused in taken}
+    assert len(tries) == 4, "moves and others, refused or not"
 
 
 @pytest.fixture(scope="module")
@@ -361,11 +425,11 @@ def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> Non
     """One that is new stands in neither list: whoever adds it decides here."""
     refused = {
         NetworkConfig: {
-            **{"cell": "refined_gru", "motion_inputs": True, "gate": "equal"},
+            **{"cell": "refined_gru", "gate": "equal"},
             **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "embeddings": False},
             "r2d2_width_factor": 3,
         },
-        EnvConfig: {"goal_distance_encoding": "rational", "goal_distance_scale": 7.0},
+        EnvConfig: {},
     }
     require_exportable(TrainConfig())
     for group, known in KNOWN_SETTINGS.items():

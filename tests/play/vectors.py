@@ -11,14 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from sqn_jax.agent.networks import initial_carry
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.play.map_data import map_data
 from sqn_jax.play.policy_data import policy_data
-from sqn_jax.policies.greedy import GreedyPolicy
+from sqn_jax.policies.greedy import step_network
 from sqn_jax.policies.run_policies import Policy
 from sqn_jax.training.motion import first_observation, next_observation
+from sqn_jax.training.state import network_of
 
 EXACT: dict[str, Any] = {"ray_iterations": 32}
 """So many hops that no ray is cut short, as the few in a thousand that need more than 8 are."""
@@ -61,14 +63,17 @@ def episode(
     rng, max_range = np.random.default_rng(seed), np.float32(world.config.max_range)
     start, goal = rng.choice(np.asarray(world.spawn_positions)[:, 0], 2, replace=False)
     pose = np.append(start, rng.uniform(-np.pi, np.pi)).astype(np.float32)
-    acting = GreedyPolicy(policy.name, policy.config, policy.params[0])
+    network = network_of(policy.config)
     obs, state = _reset(KEY, pose, goal, world)
-    seen, carry = first_observation(obs, policy.config.network), acting.start()
+    seen, carry = (
+        first_observation(obs, policy.config.network),
+        initial_carry(policy.config.network, 1)[0],
+    )
     lists: dict[str, list[Any]] = {name: [] for name in _LISTS}
     lists["poses"].append(np.asarray(state.pose))
     lists["ranges"].append(np.asarray(obs.ranges) * max_range)
     for _ in range(num_steps):
-        carry, output = acting.step(seen, carry)
+        carry, output = step_network(policy.params[0], seen, carry, network)
         action = rng.integers(5) if at_random else np.asarray(output.q_values).argmax()
         obs, state, reward, _, _, info = _step(KEY, state, np.int32(action), world)
         seen = next_observation(seen, obs, action, info["collision"])

@@ -112,6 +112,7 @@ class Controller:
         self._decided = -math.inf
         self._began = math.inf
         self._command = Command()
+        self._decided_at: Pose | None = None
 
     @property
     def has_goal(self) -> bool:
@@ -122,6 +123,7 @@ class Controller:
         """A new goal [x, y] m, or none: the policy forgets what it saw on the way to the last."""
         self._goal, self._hidden = goal, None
         self._decided, self._began, self._command = -math.inf, math.inf, Command()
+        self._decided_at = None
 
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
@@ -138,7 +140,7 @@ class Controller:
         try:
             return self._drive(pose, now)
         except ValueError as error:  # What is odd is a reason to stop, and no reason to end.
-            self._decided = -math.inf
+            self._decided, self._decided_at = -math.inf, None
             return Command(reason=str(error))
 
     def _drive(self, pose: Callable[[], Pose], now: float) -> Command:
@@ -153,7 +155,8 @@ class Controller:
             raise ValueError("there is no scan" if self._scan is None else "the scan is old")
         if age < -self.limits.stale_after:  # Simulated time or a bag began anew.
             raise ValueError("the scan is from the future: the clock went back")
-        distance, heading = goal_in_robot_frame(pose(), self._goal)
+        here = pose()
+        distance, heading = goal_in_robot_frame(here, self._goal)
         if not math.isfinite(distance + heading):
             raise ValueError("the goal or the pose is not finite")
         if distance < self.limits.goal_radius:
@@ -162,8 +165,8 @@ class Controller:
         if self._ranges is None:  # A sensor that went blind stops a command that is held, too.
             self._ranges = self._seen(self._scan)
         if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
-            self._command = self._decide(distance, heading)
-            self._decided = now
+            self._command = self._decide(distance, heading, self._is_refused(here))
+            self._decided, self._decided_at = now, here
         return self._command
 
     def _seen(self, scan: Scan) -> Any:
@@ -176,8 +179,19 @@ class Controller:
             unseen=min(self.limits.unseen, max_range),
         )
 
-    def _decide(self, distance: float, heading: float) -> Command:
-        velocity, self._hidden = self.policy.act(self._ranges, distance, heading, self._hidden)
+    def _is_refused(self, here: Pose) -> bool:
+        """Whether the last command was a move, of which the robot made less than a tenth."""
+        if self._decided_at is None:
+            return False
+        commanded = abs(self._command.speed) * self.policy.time_step * self.limits.slowdown
+        return math.dist(here[:2], self._decided_at[:2]) < commanded / 10
+
+    def _decide(self, distance: float, heading: float, refused: bool) -> Command:
+        # Only a policy that was trained with motion inputs looks at its last move.
+        more = {"refused": refused} if getattr(self.policy, "motion_size", 0) else {}
+        velocity, self._hidden = self.policy.act(
+            self._ranges, distance, heading, self._hidden, **more
+        )
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))
