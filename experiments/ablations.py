@@ -106,7 +106,12 @@ ARENAS = {
         {"sqn": 6, "r2d2": 6, "reachable": 3, "each_skill": 3, "entropy": 3, "balanced": 3},
         ("maze", *UNSEEN, "cave:100", "cave:101"),
         primary=(*UNSEEN, "cave:100", "cave:101"),
-        changes={"map": "maze*12,cave:0-11", "learner.discount": 0.995, "total_episodes": 25_600},
+        # Stated before `best` had motion inputs, distances without end and learnability.
+        changes={
+            **{"map": "maze*12,cave:0-11", "learner.discount": 0.995, "total_episodes": 25_600},
+            **{"task_sampling": "uniform", "network.motion_inputs": False},
+            "env.goal_distance_encoding": "clipped",
+        },
         eval_seeds=2,
     ),
     "paper": Arena(
