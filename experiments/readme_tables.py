@@ -78,6 +78,26 @@ def paper() -> str:
     return f"{_over_seeds(evaluation)}\n\n{_comparisons(evaluation)}"
 
 
+def paper_half() -> str:
+    """One seed of each agent halfway through `paper`: success with each epsilon and parameters."""
+    columns = [(name, "evaluation points") for name in PAPER_MAPS] + [("maze", "random pairs")]
+    rows = []
+    for algorithm, label in NAMES.items():
+        for params in ("latest", "target"):
+            entries = _results(f"paper_half_{params}.json")
+            entries += _results(f"paper_half_pairs_{params}.json")
+            names = [algorithm, *(f"{algorithm}, epsilon {epsilon}" for epsilon in (0.05, 0.1))]
+            cells = [
+                " / ".join(_mean(_one(entries, agent, name, tasks=tasks)) for agent in names)
+                for name, tasks in columns
+            ]
+            rows.append([f"{label}, {params}", *cells])
+        results = [f"{PAPER_RESULTS[algorithm][name][0]:.2f}" for name in PAPER_MAPS]
+        rows.append([f"{label} in the paper", *results, ""])
+    header = ["epsilon 0 / 0.05 / 0.1", *PAPER_MAPS, "maze, random pairs"]
+    return markdown_table(header, rows)
+
+
 def dead_ends() -> str:
     """Agents trained on the Maze and twelve caves: success of each training seed."""
     entries = _results("caves_horizon_table.json")
@@ -205,8 +225,8 @@ def starts() -> str:
 TABLES = {
     each.__name__: each
     for each in (
-        *(agents, policies, quick, seeds, paper, dead_ends, noise, external, fresh, sensors),
-        *(simulator, breakdown, training, learner, starts),
+        *(agents, policies, quick, seeds, paper, paper_half, dead_ends, noise, external, fresh),
+        *(sensors, simulator, breakdown, training, learner, starts),
     )
 }
 
