@@ -43,9 +43,19 @@ def train(arguments: list[str]) -> int:
         raise ValueError(
             f"unrecognized arguments: {' '.join(unknown)}{_suggestion(unknown, options)}"
         )
-    config = with_settings(PRESETS[preset], settings)
+    config = with_settings(PRESETS[preset], _of_start(settings) | settings)
     run_dir = options.run_dir or _default_run_dir(config, preset)
     return _run_training(config, run_dir, options)
+
+
+def _of_start(settings: dict[str, Any]) -> dict[str, Any]:
+    """The network and what it sees of a policy that training starts from, if any."""
+    if not settings.get("start_from"):
+        return {}
+    from sqn_jax.policies.pretrained import config_of
+    from sqn_jax.policies.run_policies import network_settings
+
+    return network_settings(config_of(settings["start_from"]))
 
 
 _DEFAULTS = configs.flat(configs.to_dict(TrainConfig()))

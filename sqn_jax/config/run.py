@@ -47,7 +47,8 @@ class TrainConfig:
     reached."""
     start_from: str = ""
     """A trained policy to start from in place of random parameters: a run folder,
-    "pretrained:sqn" or a file NAME.npz. Its network and sensors must be those of this run."""
+    "pretrained:sqn" or a file NAME.npz. Agent, network and what it sees are those of the policy, in
+    place of the preset's."""
     seed: int = 0
     """Seed of the first run."""
     num_seeds: int = 1

@@ -24,6 +24,7 @@ from sqn_jax.outside.reading import read_at_most, read_json
 from sqn_jax.policies.run_policies import Policy, WhichParams, load_policy, require_finite
 from sqn_jax.storage.arrays import MAX_HEADER_BYTES, read_arrays, read_headers
 from sqn_jax.storage.files import write_json, write_whole
+from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training.state import params_shapes
 
 PREFIX = "pretrained:"
@@ -58,6 +59,22 @@ def find_policy(
     return read_policy(path.parent, path.stem)
 
 
+def config_of(name: str) -> TrainConfig:
+    """The settings of a policy by the name a user gives, without its parameters.
+
+    Raises:
+        ValueError: there is none, or its settings cannot be read.
+    """
+    if names_a_run(name):
+        return RunFolder.open(Path(name))[1]
+    path = _settings_file(name)
+    description = read_json(path, MAX_JSON_BYTES, "a policy's settings")
+    if not isinstance(description, dict) or "config" not in description:
+        raise ValueError(f"policy {name}: {path.name} lacks config, expected it")
+    config: TrainConfig = configs.from_dict(description["config"])
+    return config
+
+
 def names_a_run(name: str) -> bool:
     """Whether a policy's name is that of a run folder, with all that a run leaves."""
     return not (name.startswith(PREFIX) or name.endswith(SUFFIX))
@@ -75,10 +92,14 @@ def load_pretrained(name: str) -> Policy:
     Raises:
         ValueError: there is none of this name.
     """
+    _require_pretrained(name)
+    return read_policy(_folder(), name)
+
+
+def _require_pretrained(name: str) -> None:
     if name not in pretrained_names():
         known = ", ".join(PREFIX + known_name for known_name in pretrained_names()) or "none"
         raise ValueError(f"{PREFIX}{name}: no such policy, expected one of {known}")
-    return read_policy(_folder(), name)
 
 
 def read_policy(folder: Path, name: str) -> Policy:
@@ -131,9 +152,7 @@ def card_of(name: str) -> dict[str, Any]:
     Raises:
         ValueError: the file of its settings is missing or damaged.
     """
-    own = name.startswith(PREFIX)
-    path = _folder() / f"{name.removeprefix(PREFIX)}{SUFFIX}" if own else Path(name)
-    description = read_json(path.with_suffix(".json"), MAX_JSON_BYTES, "a policy's settings")
+    description = read_json(_settings_file(name), MAX_JSON_BYTES, "a policy's settings")
     card = description.get("card", {}) if isinstance(description, dict) else {}
     return card if isinstance(card, dict) else {}
 
@@ -157,6 +176,14 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
     write_whole(folder / f"{policy.name}.npz", packed)
     digest = hashlib.sha256(packed).hexdigest()
     write_json(folder / f"{policy.name}.json", {"card": card, "config": config, "sha256": digest})
+
+
+def _settings_file(name: str) -> Path:
+    """The .json of `pretrained:NAME` or NAME.npz."""
+    if not name.startswith(PREFIX):
+        return Path(name).with_suffix(".json")
+    _require_pretrained(name.removeprefix(PREFIX))
+    return _folder() / f"{name.removeprefix(PREFIX)}.json"
 
 
 def _folder() -> Path:

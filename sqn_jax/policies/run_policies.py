@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -123,19 +123,26 @@ def of_seed(policy: Policy, seed: int | None) -> Policy:
     return Policy(policy.name, config, (policy.params[seeds.index(chosen)],))
 
 
+def network_settings(config: TrainConfig) -> dict[str, Any]:
+    """The settings that the parameters of a policy belong to, by their dotted names."""
+    settings = configs.flat(configs.to_dict(config))
+    sensors = ("num_beams", "heading_encoding", "goal_distance_encoding", "goal_distance_scale")
+    names = ["algo", *(f"env.{name}" for name in sensors)]
+    names += [name for name in settings if name.startswith("network.")]
+    return {name: settings[name] for name in names}
+
+
 def require_same_network(policy: Policy, config: TrainConfig) -> None:
     """Check that a run can start from a policy.
 
     Raises:
         ValueError: the policy is of another network, or sees other observations.
     """
-    theirs, ours = (configs.flat(configs.to_dict(run)) for run in (policy.config, config))
-    decisive = ["algo", "env.num_beams", "env.heading_encoding", "env.goal_distance_encoding"]
-    decisive += [name for name in ours if name.startswith("network.")]
-    for name in decisive:
-        if theirs[name] != ours[name]:
+    ours = network_settings(config)
+    for name, theirs in network_settings(policy.config).items():
+        if theirs != ours[name]:
             raise ValueError(
-                f"--start-from {config.start_from}: its {name} is {theirs[name]}, here it is "
+                f"--start-from {config.start_from}: its {name} is {theirs}, here it is "
                 f"{ours[name]} (--{name.replace('_', '-')})"
             )
 

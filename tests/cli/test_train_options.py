@@ -96,7 +96,7 @@ def test_every_setting_is_an_option_with_dashes_or_underscores(
             new = next(choice for choice in typing.get_args(hint) if choice != old)
             options = [f"--{name}={new}"]
         elif hint is str:
-            new = "cave"
+            new = "pretrained:sqn" if name == "start_from" else "cave"
             options = [f"--{name}", new]
         else:
             new = old * 2 if hint is int and old else old / 2 if old else 1

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from tiny_runs import TinyRuns
 
-from sqn_jax.policies.run_policies import load_policy, require_same_network
+from sqn_jax.cli import main
+from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
+from sqn_jax.config.presets import PRESETS
+from sqn_jax.policies.pretrained import write_policy
+from sqn_jax.policies.run_policies import Policy, load_policy, require_same_network
 from sqn_jax.runs.train import _starting_policy
 from sqn_jax.training.state import params_shapes
 
@@ -100,3 +106,36 @@ def test_what_is_no_policy_is_refused(runs: TinyRuns) -> None:
         assert code == 2
         assert told in err
         assert not (runs.folder / "refused").exists()
+
+
+def test_agent_network_and_what_it_sees_are_those_of_the_policy_where_none_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(
+        algo="r2d2",
+        env=EnvConfig(num_beams=31, goal_distance_encoding="rational", goal_distance_scale=7.0),
+        network=NetworkConfig(hidden_size=8, motion_inputs=True),
+    )
+    params = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params_shapes(config))
+    write_policy(tmp_path, Policy("mine", config, (params,)), {})
+    started: list[TrainConfig] = []
+
+    def note(config: TrainConfig, *_: Any) -> int:
+        started.append(config)
+        return 0
+
+    monkeypatch.setattr(importlib.import_module("sqn_jax.cli.train"), "_run_training", note)
+    start = ["train", "--start-from", str(tmp_path / "mine.npz")]
+    assert main([*start, "--env.max-range", "4"]) == 0
+    assert main([*start, "--preset", "paper", "--network.hidden-size", "16"]) == 0
+    quick, paper = started
+    found = (quick.algo, quick.network, quick.env.num_beams, quick.env.goal_distance_encoding)
+    assert found == ("r2d2", config.network, 31, "rational")
+    assert (quick.env.goal_distance_scale, quick.env.max_range) == (7.0, 4.0)
+    assert quick.learner == PRESETS["quick"].learner
+    assert (paper.network.hidden_size, paper.network.motion_inputs) == (16, True)
+    assert _starting_policy(quick) is not None
+    with pytest.raises(ValueError, match=r"its network\.hidden_size is 8, here it is 16"):
+        _starting_policy(paper)
+    (tmp_path / "mine.json").write_text("[]")
+    assert main(start) == 2
