@@ -14,7 +14,6 @@ import numpy as np
 from sqn_jax import config as configs
 from sqn_jax.agent.networks import Params
 from sqn_jax.config import TrainConfig
-from sqn_jax.storage.checkpoint import Checkpoints
 from sqn_jax.storage.manifest import Origin, leaves_of
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
 from sqn_jax.training.devices import put
@@ -59,6 +58,9 @@ def load_policy(
             or it holds no such checkpoint, or a damaged one.
         Mismatch: the checkpoint is of another run than the config says.
     """
+    # Orbax takes a fifth of a second to import, which no `pretrained:NAME` needs.
+    from sqn_jax.storage.checkpoint import Checkpoints
+
     _, config = RunFolder.open(run_dir)
     if not (run_dir / CHECKPOINTS).is_dir():
         raise ValueError(f"run folder {run_dir}: holds no checkpoint, train it first")

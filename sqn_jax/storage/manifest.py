@@ -13,12 +13,12 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import orbax.checkpoint
 
 import sqn_jax
 from sqn_jax import config as configs
@@ -290,7 +290,7 @@ def versions() -> dict[str, str]:
     return {
         "sqn_jax": sqn_jax.__version__,
         "jax": jax.__version__,
-        "orbax": orbax.checkpoint.__version__,
+        "orbax": version("orbax-checkpoint"),
         "python": platform.python_version(),
     }
 
