@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,9 +53,11 @@ class Oracle:
     """Plans for E robots, each with its own goal, and keeps the plans while they hold."""
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
-        """Compute the paths to all goals [E, 2]; a goal that occurs twice is computed once."""
-        self.search = BeamSearch(occupancy_map, env_params, goals)
+        """Goals [E, 2] m; nothing is searched before it is needed."""
+        _require_plannable(occupancy_map, env_params)
+        self._world = occupancy_map, env_params
         self.goals = goals
+        self.goal_radius = float(env_params.goal_radius)
         self.repairs = env_params.config.velocity_noise > 0
         self.arrived = np.zeros(len(goals), dtype=bool)
         self.step = 0
@@ -65,13 +68,32 @@ class Oracle:
         """Where the robots are before each of these actions; NaN where nothing is planned."""
         self.before: tuple[Floats, Ints] | None = None
 
-    def prepare(self, poses: Floats) -> None:
-        """Plan from the first poses [E, 3], which `choose` will get: beside other work, say."""
+    @cached_property
+    def search(self) -> BeamSearch:
+        """What plans, with the paths to all goals; a goal that occurs twice is computed once."""
+        return BeamSearch(*self._world, self.goals)
+
+    def prepare(self, poses: Floats) -> dict[str, NDArray[Any]]:
+        """Plan from the first poses [E, 3], which `choose` will get: beside other work, say.
+
+        Returns:
+            The arguments of `take_over`.
+        """
         self._plan(np.arange(len(poses)), poses)
+        return {"actions": self.actions, "planned": self.planned}
+
+    def take_over(self, actions: NDArray[np.int8], planned: NDArray[np.float32]) -> None:
+        """Go by the plans of another oracle, that `prepare` has made for the same robots.
+
+        Args:
+            actions: [E, T] of each step.
+            planned: [E, T, 3] where the robots are before it.
+        """
+        self.actions, self.planned = actions.copy(), planned.copy()
 
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
-        self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.search.goal_radius
+        self.arrived |= np.hypot(*(poses[:, :2] - self.goals).T) < self.goal_radius
         if self.before is not None and not self.repairs:
             self._note_refusals(poses, *self.before)
         lost = np.flatnonzero(~self.arrived & ~_is_at(poses, self.planned[:, self.step]))
@@ -111,6 +133,17 @@ class Oracle:
                 return
 
 
+def _require_plannable(occupancy_map: OccupancyMap, env_params: EnvParams) -> None:
+    config = env_params.config
+    if occupancy_map.shape != env_params.body.shape:
+        raise ValueError(
+            f"map {occupancy_map.name!r} has {occupancy_map.shape} cells, "
+            f"expected {env_params.body.shape} as in env_params"
+        )
+    if min(config.forward_speed, config.backward_speed, config.turn_rate, config.time_step) <= 0:
+        raise ValueError("the robot cannot move or turn, expected speeds above 0")
+
+
 class _Beam(NamedTuple):
     """The poses that the search continues from, `P` for each of N robots, best first.
 
@@ -137,16 +170,9 @@ class BeamSearch:
 
     def __init__(self, occupancy_map: OccupancyMap, env_params: EnvParams, goals: Floats) -> None:
         config = env_params.config
-        if occupancy_map.shape != env_params.body.shape:
-            raise ValueError(
-                f"map {occupancy_map.name!r} has {occupancy_map.shape} cells, "
-                f"expected {env_params.body.shape} as in env_params"
-            )
         self.forward = config.forward_speed * config.time_step
         self.backward = config.backward_speed * config.time_step
         self.turn = config.turn_rate * config.time_step
-        if min(self.forward, self.backward, self.turn) <= 0:
-            raise ValueError("the robot cannot move or turn, expected speeds above 0")
         self.headings = max(1, round(2 * np.pi / self.turn))
         self.goal_radius = float(env_params.goal_radius)
         self.resolution = occupancy_map.resolution

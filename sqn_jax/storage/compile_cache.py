@@ -42,6 +42,15 @@ _TROUBLE = re.compile(
 """How JAX warns of a program it cannot use; it then compiles as if there were none."""
 
 
+_in_use: list[Path] = []
+"""The folder of `cached_programs`, within it."""
+
+
+def folder_in_use() -> Path | None:
+    """Where compiled programs are kept now, if they are."""
+    return _in_use[-1] if _in_use else None
+
+
 @contextmanager
 def cached_programs() -> Iterator[None]:
     """Keep and reuse compiled programs within this context, if a folder for them can be used.
@@ -65,10 +74,12 @@ def cached_programs() -> Iterator[None]:
     before = {name: _setting(name) for name in options}
     for name, value in options.items():
         jax.config.update(name, value)
+    _in_use.append(folder)
     try:
         with _sealed(folder), _warnings_in_one_line(folder):
             yield
     finally:
+        _in_use.pop()
         for name, value in before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
@@ -140,12 +151,12 @@ def _tidy(folder: Path) -> None:
     bytes_left, damaged = LARGEST_BYTES, 0
     entries = folder.glob(f"*{ENTRY}")
     for entry in sorted(entries, key=lambda path: path.lstat().st_mtime, reverse=True):
-        seal = _seal_of(entry)
+        seal = seal_of(entry)
         is_sealed = os.path.lexists(seal)  # Else a process was killed before it was finished.
-        is_sound = is_sealed and _is_sound(entry, seal)
-        damaged += is_sealed and not is_sound
-        bytes_left -= entry.lstat().st_size if is_sound else 0
-        if not is_sound or bytes_left < 0:
+        sound = is_sealed and is_sound(entry, seal)
+        damaged += is_sealed and not sound
+        bytes_left -= entry.lstat().st_size if sound else 0
+        if not sound or bytes_left < 0:
             for path in (entry, seal):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
@@ -161,8 +172,8 @@ def _sealed(folder: Path) -> Iterator[None]:
     def seal(event: str, *_: object, **__: object) -> None:
         for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
             with suppress(OSError, ValueError):
-                if not _seal_of(entry).exists():
-                    _seal_of(entry).write_bytes(_digest(entry))
+                if not seal_of(entry).exists():
+                    seal_of(entry).write_bytes(digest_of(entry))
 
     jax.monitoring.register_event_duration_secs_listener(seal)
     try:
@@ -171,20 +182,20 @@ def _sealed(folder: Path) -> Iterator[None]:
         jax.monitoring.unregister_event_duration_listener(seal)
 
 
-def _seal_of(entry: Path) -> Path:
+def seal_of(entry: Path) -> Path:
     return entry.with_name(entry.name.removesuffix(ENTRY) + "-sha256")
 
 
-def _is_sound(entry: Path, seal: Path) -> bool:
+def is_sound(entry: Path, seal: Path) -> bool:
     """Whether an entry is what was written; links, pipes and folders are none."""
     try:
         expected = read_at_most(seal, 64, "a checksum", follow=False)
-        return expected == _digest(entry)
+        return expected == digest_of(entry)
     except (OSError, ValueError):
         return False
 
 
-def _digest(path: Path) -> bytes:
+def digest_of(path: Path) -> bytes:
     data = read_at_most(path, LARGEST_BYTES, "a compiled program", follow=False)
     return hashlib.sha256(data).hexdigest().encode()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,6 +27,7 @@ from sqn_jax.evaluation.baseline_episodes import run_baseline
 from sqn_jax.evaluation.episodes import episode_keys, run_episodes
 from sqn_jax.evaluation.statistics import success_weighted_path_length
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
+from sqn_jax.storage.compile_cache import cached_programs
 
 KEY = jax.random.key(11)
 
@@ -256,6 +259,37 @@ def test_shortest_paths_know_distance_direction_and_bends() -> None:
     bent = paths.steps_left(np.array([0]), pose[:1], 0.25, 0.125)[0]
     length = paths.length[paths.which[0], paths.index[20, 20]]
     assert bent > length / 0.25 + 3
+
+
+def test_plans_that_are_kept_are_not_searched_again_and_give_the_same_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, world = small_room()
+
+    def ahead(key: jax.Array = KEY, world: EnvParams = world) -> Any:
+        keys = episode_keys(key, 6)
+        navigator = baseline_episodes.oracle_ahead(keys, small, world)
+        return run_baseline(keys, navigator, world, fields=("actions", "poses"))
+
+    expected = ahead()
+    assert expected[0][0].success.all()
+    monkeypatch.setenv("SQN_JAX_CACHE", str(tmp_path / "kept"))
+    found = []
+    for searches in (True, False):
+        with cached_programs():
+            if not searches:
+                monkeypatch.setattr(BeamSearch, "plan", None)
+            found.append(ahead())
+    for each in found:
+        jax.tree.map(np.testing.assert_array_equal, each, expected)
+    with cached_programs():
+        for other in (
+            {"key": jax.random.key(12)},
+            {"world": dataclasses.replace(world, max_steps=59)},
+            {"world": make_env(small, EnvConfig(forward_speed=2.0))},
+        ):
+            with pytest.raises(TypeError, match="not callable"):
+                ahead(**other)
 
 
 def test_oracle_mends_its_plan_under_noise() -> None:

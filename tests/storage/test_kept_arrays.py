@@ -1,0 +1,107 @@
+"""Arrays kept beside compiled programs: computed once, and never read where they may be others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sqn_jax.storage.compile_cache import cached_programs
+from sqn_jax.storage.kept_arrays import code_of, kept_arrays
+
+
+class Maker:
+    """Counts how often it computes."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self) -> dict[str, np.ndarray]:
+        self.calls += 1
+        return {"a": np.arange(6, dtype=np.int8).reshape(2, 3), "b": np.float32([np.nan, 2.5])}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("SQN_JAX_CACHE", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+def test_what_is_kept_comes_back_with_its_types(folder: Path) -> None:
+    make = Maker()
+    found = []
+    for _ in range(2):  # Two commands.
+        with cached_programs():
+            found.append(kept_arrays("plans", [b"map", b"robot"], make))
+    assert make.calls == 1
+    for name, array in make().items():
+        for each in found:
+            assert each[name].dtype == array.dtype
+            np.testing.assert_array_equal(each[name], array)
+    assert [path.name[:6] for path in folder.glob("*-cache")] == ["plans-"]
+
+
+def test_what_depends_on_something_else_is_computed_anew(folder: Path) -> None:
+    make = Maker()
+    with cached_programs():
+        # The same bytes, divided otherwise, are something else, too.
+        for parts in ([b"ab", b"c"], [b"a", b"bc"], [b"abc"], [b"ab", b"c"]):
+            kept_arrays("plans", parts, make)
+        kept_arrays("paths", [b"abc"], make)
+    assert make.calls == 4
+
+
+def test_nothing_is_kept_where_no_programs_are(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = Maker()
+    kept_arrays("plans", [b"x"], make)
+    monkeypatch.setenv("SQN_JAX_CACHE", "off")
+    with cached_programs():
+        kept_arrays("plans", [b"x"], make)
+    assert make.calls == 2
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("damage", ["flipped", "unsealed", "link"])
+def test_what_was_changed_is_not_read(folder: Path, damage: str, tmp_path: Path) -> None:
+    make = Maker()
+    with cached_programs():
+        kept_arrays("plans", [b"x"], make)
+        (entry,) = folder.glob("*-cache")
+        data = bytearray(entry.read_bytes())
+        if damage == "flipped":
+            data[len(data) // 2] ^= 1
+            entry.write_bytes(data)
+        elif damage == "link":
+            (tmp_path / "elsewhere").write_bytes(data)
+            entry.unlink()
+            entry.symlink_to(tmp_path / "elsewhere")
+        else:  # A process was killed before it was sealed.
+            next(folder.glob("*-sha256")).unlink()
+        np.testing.assert_array_equal(kept_arrays("plans", [b"x"], make)["a"], make()["a"])
+        assert make.calls == 3
+        kept_arrays("plans", [b"x"], make)
+        assert make.calls == 3, "it was not kept again"
+
+
+def test_a_full_disk_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sqn_jax.storage.kept_arrays.write_whole", full)
+    with cached_programs():
+        assert kept_arrays("plans", [b"x"], Maker()).keys() == {"a", "b"}
+
+
+def test_other_code_is_something_else(tmp_path: Path) -> None:
+    modules = []
+    for name, text in (("one", "x = 1\n"), ("two", "x = 2\n")):
+        module = ModuleType(name)
+        module.__file__ = str(tmp_path / f"{name}.py")
+        Path(module.__file__).write_text(text)
+        modules.append(module)
+    assert code_of(modules[0]) != code_of(modules[1])
+    assert code_of(modules[0]) == code_of(modules[0])
