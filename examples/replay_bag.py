@@ -204,7 +204,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         limits = Limits(
             options.max_speed, options.max_turn_rate, options.slowdown, options.goal_radius
         )
-        controller = Controller(load_policy(options.policy), limits)
+        controller = Controller(load_policy(options.policy), limits, obeyed=False)
         topics = {kind: getattr(options, kind) for kind in ("scan", "goal", "pose")}
         mount = Mount(*options.mount, upside_down=options.upside_down)
         rows = replay(read_events(options.bag, topics), controller, mount)

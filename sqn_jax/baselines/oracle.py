@@ -73,23 +73,21 @@ class Oracle:
         """What plans, with the paths to all goals; a goal that occurs twice is computed once."""
         return BeamSearch(*self._world, self.goals)
 
-    def prepare(self, poses: Floats) -> dict[str, NDArray[Any]]:
+    def plans(self, poses: Floats) -> dict[str, NDArray[Any]]:
         """Plan from the first poses [E, 3], which `choose` will get: beside other work, say.
 
         Returns:
-            The arguments of `take_over`.
+            `actions` [E, T'] of each step until the last robot has arrived, and `planned`
+            [E, T', 3], where the robots are before it: what `follow` takes.
         """
         self._plan(np.arange(len(poses)), poses)
-        return {"actions": self.actions, "planned": self.planned}
+        length = int(np.isfinite(self.planned[..., 0]).any(axis=0).sum())
+        return {"actions": self.actions[:, :length], "planned": self.planned[:, :length]}
 
-    def take_over(self, actions: NDArray[np.int8], planned: NDArray[np.float32]) -> None:
-        """Go by the plans of another oracle, that `prepare` has made for the same robots.
-
-        Args:
-            actions: [E, T] of each step.
-            planned: [E, T, 3] where the robots are before it.
-        """
-        self.actions, self.planned = actions.copy(), planned.copy()
+    def follow(self, actions: NDArray[np.int8], planned: NDArray[np.float32]) -> None:
+        """Go by plans that `plans` has made for the same robots, maybe of another oracle."""
+        length = actions.shape[1]
+        self.actions[:, :length], self.planned[:, :length] = actions, planned
 
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""

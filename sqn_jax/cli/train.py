@@ -53,9 +53,9 @@ def _of_start(settings: dict[str, Any]) -> dict[str, Any]:
     if not settings.get("start_from"):
         return {}
     from sqn_jax.policies.pretrained import config_of
-    from sqn_jax.policies.run_policies import network_settings
+    from sqn_jax.policies.run_policies import settings_to_start_from
 
-    return network_settings(config_of(settings["start_from"]))
+    return settings_to_start_from(config_of(settings["start_from"]))
 
 
 _DEFAULTS = configs.flat(configs.to_dict(TrainConfig()))

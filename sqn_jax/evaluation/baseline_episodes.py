@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from sqn_jax.agent.networks import QOutput
 from sqn_jax.agent.trajectory import Trajectory, over_robots
-from sqn_jax.baselines import oracle as oracle_module
-from sqn_jax.baselines import shortest_paths
 from sqn_jax.baselines.bug import Bug, BugMemory
 from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.config import EnvConfig
@@ -39,8 +37,8 @@ from sqn_jax.evaluation.episodes import (
     step_by_hand,
     task_metrics,
 )
-from sqn_jax.maps import OccupancyMap, distance, occupancy
-from sqn_jax.storage.kept_arrays import code_of, kept_arrays
+from sqn_jax.evaluation.kept_paths import prepared_oracle
+from sqn_jax.maps import OccupancyMap
 from sqn_jax.training.rollout import ActorState, EpisodeMetrics, step_actors, with_ends
 
 CHUNK = 100
@@ -110,28 +108,9 @@ def oracle_ahead(keys: Array, occupancy_map: OccupancyMap, env_params: EnvParams
     goals, poses = jax.device_get((first.env_state.goal, first.env_state.pose))
 
     thread = ThreadPoolExecutor(1)
-    planner = thread.submit(_prepared, occupancy_map, env_params, goals, poses)
+    planner = thread.submit(prepared_oracle, occupancy_map, env_params, goals, poses)
     thread.shutdown(wait=False)
     return planned(lambda _: planner.result())
-
-
-def _prepared(
-    occupancy_map: OccupancyMap,
-    env_params: EnvParams,
-    goals: NDArray[np.floating],
-    poses: NDArray[np.floating],
-) -> Oracle:
-    """An oracle that has planned from poses [E, 3] to goals [E, 2], by plans that are kept."""
-    planner = Oracle(occupancy_map, env_params, goals.astype(np.float64))
-    depends_on = [
-        code_of(oracle_module, shortest_paths, distance, occupancy),
-        repr((env_params.config, float(env_params.goal_radius), env_params.max_steps)).encode(),
-        repr((occupancy_map.resolution, occupancy_map.shape)).encode(),
-        *(array.tobytes() for array in (occupancy_map.occupied, goals, poses)),
-    ]
-    plans = kept_arrays("plans", depends_on, lambda: planner.prepare(poses.astype(np.float64)))
-    planner.take_over(**plans)
-    return planner
 
 
 def planned(make: Callable[[NDArray[np.float64]], Planner]) -> Navigator:

@@ -16,15 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines import shortest_paths
-from sqn_jax.baselines.shortest_paths import has_paths, require_paths, shortest_path_lengths
+from sqn_jax.baselines.shortest_paths import has_paths, require_paths
 from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.episodes import EpisodeResults
+from sqn_jax.evaluation.kept_paths import path_lengths
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
-from sqn_jax.maps import OccupancyMap, distance, load_map, occupancy, step_warning
-from sqn_jax.storage.kept_arrays import code_of, kept_arrays
+from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.training import memory_budget
 
 EPISODES_AT_ONCE = 2_000
@@ -281,20 +280,7 @@ def _shortest_paths(
     """[E] m; None on a map that is too large to search paths on."""
     if not has_paths(occupancy_map):
         return None
-
-    def searched() -> dict[str, NDArray[np.float64]]:
-        return {
-            "lengths": shortest_path_lengths(
-                occupancy_map, starts, goals, robot_radius=robot_radius
-            )
-        }
-
-    depends_on = [
-        code_of(shortest_paths, distance, occupancy),
-        repr((occupancy_map.resolution, occupancy_map.shape, robot_radius)).encode(),
-        *(array.tobytes() for array in (occupancy_map.occupied, starts, goals)),
-    ]
-    return kept_arrays("paths", depends_on, searched)["lengths"]
+    return path_lengths(occupancy_map, starts, goals, robot_radius=robot_radius)
 
 
 def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:

@@ -76,12 +76,12 @@ def check_export(folder: Path) -> list[Agreement]:
     """
     require_libraries("onnx", "onnxruntime")
     contents = _read_whole(folder)
-    config, description = _described(folder, contents[CONFIG])
     if contents[RUNTIME] != runtime_source():
         raise ValueError(
             f"{named(folder / RUNTIME)}: is not that of this version of sqn_jax, expected an "
             "export of this version"
         )
+    config, description = _described(folder, contents[CONFIG])
     _require_params(folder, contents[PARAMS], config)
     if hashlib.sha256(contents[PARAMS]).hexdigest() != description["params_sha256"]:
         raise ValueError(

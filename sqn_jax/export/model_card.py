@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from sqn_jax.config import TrainConfig
+from sqn_jax.export.description import observation_size, state_size
 from sqn_jax.outside.reading import read_json
 from sqn_jax.policies.pretrained import card_of, names_a_run
 from sqn_jax.policies.run_policies import Policy
@@ -89,7 +90,7 @@ def model_card(policy: Policy, results: Sequence[Result], terms: str = "") -> st
         _robot(policy.config),
         _results(policy.config, results),
         _failures(policy.config, results),
-        _USE,
+        _use(policy.config),
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -185,14 +186,24 @@ def _failures(config: TrainConfig, results: Sequence[Result]) -> str:
     return "\n".join(["## Known failures", "", *lines])
 
 
-_USE = """## Use
+def _use(config: TrainConfig) -> str:
+    told, call = "", "ranges, distance, heading, hidden"
+    if config.network.motion_inputs:
+        told = (
+            " At the end of `obs` stands 1 if the last command\n  was a move and the robot did not "
+            "move, else 0; `h_in` holds the last action, too."
+        )
+        call += ", refused"
+    return f"""## Use
 
-- `policy.onnx`: any ONNX runtime, opset 17. Inputs `obs` [1, ranges and goal] in m, m and rad and
-  `h_in`, zeros at each new goal; outputs `actions` [[m/s, rad/s]], `action_index`, `q_values`,
-  `skill_weights`, `h_out`. The order of the beams, the commands and all else that a robot needs are
+- `policy.onnx`: any ONNX runtime, opset 17. Inputs `obs` [1, {observation_size(config)}], ranges in
+  m, the goal's distance in m and heading in rad, and `h_in` [1, 1, {state_size(config)}], zeros at
+  each new goal; outputs `actions` [[m/s, rad/s]], `action_index`, `q_values`, `skill_weights`,
+  `h_out`.{told} The order of the beams, the commands and all else that a robot needs are
   in its metadata. Ranges may be infinite or NaN where nothing is hit. With value rescaling,
   Q-values are those of the rescaled return.
-- `sqn_policy.py` with `params.safetensors` and `config.json`: Python 3.8 and NumPy.
+- `sqn_policy.py` with `params.safetensors` and `config.json`: Python 3.8 and NumPy:
+  `policy.act({call})`.
 - `reference.npz`: observations, hidden states, Q-values and actions of a rollout, to compare with.
 - `SHA256SUMS`: `sha256sum -c SHA256SUMS` says whether a file has changed;
   `sqn export --check FOLDER` runs both and compares."""

@@ -171,8 +171,10 @@ def _observation(graph: _Graph, env: EnvConfig) -> tuple[str, str]:
         scaled = graph.node("Div", distance, graph.constant(env.max_goal_distance))
         parts = [graph.node("Clip", scaled, zero, one)]
     else:
-        further = graph.node("Add", distance, graph.constant(env.goal_distance_scale))
-        parts = [graph.node("Div", distance, further)]
+        # d / (d + c), written so that an infinite distance is 1 and not NaN.
+        scale = graph.constant(env.goal_distance_scale)
+        nearness = graph.node("Div", scale, graph.node("Add", distance, scale))
+        parts = [graph.node("Sub", one, nearness)]
     heading = _columns(graph, "obs", env.num_beams + 1, env.num_beams + 2)
     if env.heading_encoding == "linear":
         parts.append(_turns(graph, heading))

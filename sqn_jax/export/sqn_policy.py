@@ -3,7 +3,7 @@
 policy = Policy("params.safetensors")  # config.json beside it; or NAME.npz and NAME.json
 command, hidden = policy.act(ranges, distance, heading, hidden)  # [v m/s, w rad/s] for time_step s
 Ranges: m along `policy.beam_angles` (rad, left is positive), inf or NaN where nothing is hit. Goal:
-m and rad, NaN: wait. Hidden: None at each new goal. Refused, if `motion_size` > 0: a move failed.
+m and rad, NaN: wait. Hidden: None at each new goal. Refused (if motion_size): a move moved nothing.
 """
 
 import json
@@ -32,7 +32,7 @@ class Policy:
         cut = {name: data[start:][slice(*header[name]["data_offsets"])] for name in header}
         return {key: np.frombuffer(cut[key], "<f4").reshape(header[key]["shape"]) for key in cut}
 
-    def act(self, ranges, distance, heading, hidden=None, refused=False):
+    def act(self, ranges, distance, heading, hidden=None, refused=None):
         obs = np.append(ranges, [distance, heading] + [refused] * bool(self.motion_size))
         hidden = np.zeros(self.size + self.motion_size) if hidden is None else hidden
         q_values, _, after = self.step(obs, hidden)
@@ -54,9 +54,9 @@ class Policy:
         seen = {"linear": [np.where(abs(turns - 0.5) > 0.5, turns - np.floor(turns), turns)]}
         seen["sincos"] = [(1 + np.sin(heading)) / 2, (1 + np.cos(heading)) / 2]
         seen["clipped"] = [np.clip(distance / self.env["max_goal_distance"], 0, 1)]
-        seen["rational"] = [distance / (distance + self.env.get("goal_distance_scale", 1))]
-        distance_as = self.env.get("goal_distance_encoding", "clipped")
-        goal = np.concatenate(seen[distance_as] + seen[self.env["heading_encoding"]])
+        seen["rational"] = [1 - 1 / (1 + distance / self.env.get("goal_distance_scale", 1))]
+        parts = seen[self.env.get("goal_distance_encoding", "clipped")]
+        goal = np.concatenate(parts + seen[self.env["heading_encoding"]])
         x = [self.mlp("features/ranges", ranges), self.mlp("features/goal", goal), last]
         return np.concatenate([*x, refused * last[1:3].sum()])
 

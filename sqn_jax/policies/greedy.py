@@ -25,7 +25,7 @@ class GreedyPolicy:
     Example:
         >>> policy = load_policy("pretrained:sqn")
         >>> carry = policy.start()
-        >>> action, carry = policy.act(obs, carry)
+        >>> action, carry = policy.act(obs, carry, refused=False)
     """
 
     name: str
@@ -43,32 +43,46 @@ class GreedyPolicy:
         return jnp.concatenate([carry, jnp.zeros(actions)])
 
     def act(
-        self, obs: HasObservation, carry: Array, *, refused: bool | Array = False
+        self, obs: HasObservation, carry: Array, *, refused: bool | Array | None = None
     ) -> tuple[Array, Array]:
         """Choose an action.
 
         Args:
             obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot.
             carry: from `start` or the step before.
-            refused: whether the last move failed, `info["collision"]` of `sqn_jax.step`; only a
-                policy with `network.motion_inputs` looks at it.
+            refused: whether the last move failed, `info["collision"]` of `sqn_jax.step`; False at
+                first. A policy with `network.motion_inputs` needs it, others ignore it.
 
         Returns:
             The action, 0 to 4, and the next carry.
+
+        Raises:
+            ValueError: the policy needs `refused`, and it is not given.
         """
         carry, output = self.step(obs, carry, refused=refused)
         return output.q_values.argmax(), carry
 
     def step(
-        self, obs: HasObservation, carry: Array, *, refused: bool | Array = False
+        self, obs: HasObservation, carry: Array, *, refused: bool | Array | None = None
     ) -> tuple[Array, QOutput]:
         """The next carry and all that the network says of an observation, without batch axes.
 
         See `act`; the action in the carry is that of the largest value.
         """
+        if refused is None and self.config.network.motion_inputs:
+            raise ValueError(
+                f"policy {self.name} has network.motion_inputs, expected refused=False at first "
+                "and then info['collision'] of the step before"
+            )
         return cast(
             tuple[Array, QOutput],
-            step_policy(self.params, obs, carry, jnp.asarray(refused), network_of(self.config)),
+            step_policy(
+                self.params,
+                obs,
+                carry,
+                jnp.asarray(False if refused is None else refused),
+                network_of(self.config),
+            ),
         )
 
 

@@ -68,10 +68,13 @@ def config_of(name: str) -> TrainConfig:
     if names_a_run(name):
         return RunFolder.open(Path(name))[1]
     path = _settings_file(name)
-    description = read_json(path, MAX_JSON_BYTES, "a policy's settings")
-    if not isinstance(description, dict) or "config" not in description:
-        raise ValueError(f"policy {name}: {path.name} lacks config, expected it")
-    config: TrainConfig = configs.from_dict(description["config"])
+    try:
+        description = read_json(path, MAX_JSON_BYTES, "a policy's settings")
+        if not isinstance(description, dict) or "config" not in description:
+            raise ValueError(f"{path.name} lacks config, expected it")
+        config: TrainConfig = configs.from_dict(description["config"])
+    except ValueError as error:
+        raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
     return config
 
 

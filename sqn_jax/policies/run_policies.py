@@ -128,10 +128,19 @@ def of_seed(policy: Policy, seed: int | None) -> Policy:
 def network_settings(config: TrainConfig) -> dict[str, Any]:
     """The settings that the parameters of a policy belong to, by their dotted names."""
     settings = configs.flat(configs.to_dict(config))
-    sensors = ("num_beams", "heading_encoding", "goal_distance_encoding", "goal_distance_scale")
-    names = ["algo", *(f"env.{name}" for name in sensors)]
+    names = ["algo", "env.num_beams", "env.heading_encoding", "env.goal_distance_encoding"]
     names += [name for name in settings if name.startswith("network.")]
     return {name: settings[name] for name in names}
+
+
+def settings_to_start_from(config: TrainConfig) -> dict[str, Any]:
+    """What a run takes over from a policy it starts from, unless it says something else.
+
+    Those of `network_settings`, and the scales of the goal's distance, which may be changed.
+    """
+    settings = configs.flat(configs.to_dict(config))
+    scales = ("env.max_goal_distance", "env.goal_distance_scale")
+    return network_settings(config) | {name: settings[name] for name in scales}
 
 
 def require_same_network(policy: Policy, config: TrainConfig) -> None:

@@ -33,6 +33,12 @@ VARIABLE = "SQN_JAX_CACHE"
 LARGEST_BYTES = 2**28
 """What the folder may hold when a run starts; all programs of a run take a few MB."""
 
+LARGEST_ARRAYS = 2**26
+"""What the arrays beside the programs may take (`kept_arrays`)."""
+
+ARRAYS = "arrays-"
+"""How the names of files with arrays begin."""
+
 ENTRY = "-cache"
 """How JAX's files end; a checksum lies beside each."""
 
@@ -43,7 +49,7 @@ _TROUBLE = re.compile(
 
 
 _in_use: list[Path] = []
-"""The folder of `cached_programs`, within it."""
+"""The folders of the open contexts of `cached_programs`, the innermost last."""
 
 
 def folder_in_use() -> Path | None:
@@ -148,15 +154,15 @@ def _tidy(folder: Path) -> None:
     gives wrong numbers. JAX's own limit needs another package, and fails for good once a process
     was killed between an entry and its time stamp.
     """
-    bytes_left, damaged = LARGEST_BYTES, 0
+    bytes_left, damaged = {True: LARGEST_ARRAYS, False: LARGEST_BYTES}, 0
     entries = folder.glob(f"*{ENTRY}")
     for entry in sorted(entries, key=lambda path: path.lstat().st_mtime, reverse=True):
-        seal = seal_of(entry)
+        seal, is_arrays = seal_of(entry), entry.name.startswith(ARRAYS)
         is_sealed = os.path.lexists(seal)  # Else a process was killed before it was finished.
-        sound = is_sealed and is_sound(entry, seal)
+        sound = is_sealed and _is_sound(entry, seal)
         damaged += is_sealed and not sound
-        bytes_left -= entry.lstat().st_size if sound else 0
-        if not sound or bytes_left < 0:
+        bytes_left[is_arrays] -= entry.lstat().st_size if sound else 0
+        if not sound or bytes_left[is_arrays] < 0:
             for path in (entry, seal):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
@@ -173,7 +179,7 @@ def _sealed(folder: Path) -> Iterator[None]:
         for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
             with suppress(OSError, ValueError):
                 if not seal_of(entry).exists():
-                    seal_of(entry).write_bytes(digest_of(entry))
+                    seal_of(entry).write_bytes(_digest(entry))
 
     jax.monitoring.register_event_duration_secs_listener(seal)
     try:
@@ -183,19 +189,20 @@ def _sealed(folder: Path) -> Iterator[None]:
 
 
 def seal_of(entry: Path) -> Path:
+    """The file with the checksum of an entry."""
     return entry.with_name(entry.name.removesuffix(ENTRY) + "-sha256")
 
 
-def is_sound(entry: Path, seal: Path) -> bool:
+def _is_sound(entry: Path, seal: Path) -> bool:
     """Whether an entry is what was written; links, pipes and folders are none."""
     try:
         expected = read_at_most(seal, 64, "a checksum", follow=False)
-        return expected == digest_of(entry)
+        return expected == _digest(entry)
     except (OSError, ValueError):
         return False
 
 
-def digest_of(path: Path) -> bytes:
+def _digest(path: Path) -> bytes:
     data = read_at_most(path, LARGEST_BYTES, "a compiled program", follow=False)
     return hashlib.sha256(data).hexdigest().encode()
 

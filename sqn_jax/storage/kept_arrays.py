@@ -15,19 +15,16 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sqn_jax.outside.reading import read_at_most
 from sqn_jax.storage.arrays import read_arrays, read_headers
-from sqn_jax.storage.compile_cache import (
-    ENTRY,
-    LARGEST_BYTES,
-    digest_of,
-    folder_in_use,
-    is_sound,
-    seal_of,
-)
+from sqn_jax.storage.compile_cache import ARRAYS, ENTRY, folder_in_use, seal_of
 from sqn_jax.storage.files import write_whole
+
+LARGEST_FILE = 2**24
+"""Bytes of a file; what is larger is not kept."""
 
 
 def kept_arrays(
@@ -37,8 +34,7 @@ def kept_arrays(
 ) -> dict[str, NDArray[Any]]:
     """What `make` returns, computed once for all commands.
 
-    A file that has changed since it was written is not read, and is deleted when the next command
-    starts, as a damaged program is.
+    A file that is missing, damaged or cannot be written is no error: the arrays are computed.
 
     Args:
         kind: what the arrays are, for the name of the file.
@@ -49,20 +45,34 @@ def kept_arrays(
     if folder is None:
         return dict(make())
     lengths_and_parts = b"".join(len(part).to_bytes(8, "little") + part for part in depends_on)
-    entry = folder / f"{kind}-{hashlib.sha256(lengths_and_parts).hexdigest()}{ENTRY}"
-    if is_sound(entry, seal_of(entry)):
-        packed = read_at_most(entry, LARGEST_BYTES, "kept arrays", follow=False)
-        return read_arrays(packed, read_headers(packed))
+    name = f"{ARRAYS}{kind}-{hashlib.sha256(lengths_and_parts).hexdigest()}{ENTRY}"
+    entry, seal = folder / name, seal_of(folder / name)
+    with suppress(OSError, ValueError):
+        packed = read_at_most(entry, LARGEST_FILE, "kept arrays", follow=False)
+        if read_at_most(seal, 64, "a checksum", follow=False) == _checksum(packed):
+            return read_arrays(packed, read_headers(packed))
     arrays = dict(make())
     file = io.BytesIO()
     np.savez_compressed(file, allow_pickle=False, **arrays)
-    with suppress(OSError):  # Where no program can be written either, of which a line tells.
-        write_whole(entry, file.getvalue())
-        write_whole(seal_of(entry), digest_of(entry))
+    packed = file.getvalue()
+    if len(packed) <= LARGEST_FILE:
+        with suppress(OSError, ValueError):
+            # The checksum first: what has none is deleted by the next command that starts.
+            write_whole(seal, _checksum(packed))
+            write_whole(entry, packed)
     return arrays
 
 
+def _checksum(packed: bytes) -> bytes:
+    return hashlib.sha256(packed).hexdigest().encode()
+
+
 def code_of(*modules: ModuleType) -> bytes:
-    """The source of modules, and the version of NumPy: with others numbers may be others."""
+    """A digest of the source of modules and of the libraries: with others numbers may be others.
+
+    To be called when the modules are imported: a file may be edited later.
+    """
     files = [Path(module.__file__) for module in modules if module.__file__ is not None]
-    return b"".join(path.read_bytes() for path in files) + np.__version__.encode()
+    texts = [path.read_bytes() for path in files]
+    versions = f"NumPy {np.__version__}, SciPy {scipy.__version__}".encode()
+    return hashlib.sha256(b"".join([*texts, versions])).digest()

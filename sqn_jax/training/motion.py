@@ -69,7 +69,7 @@ def with_motion(obs: HasObservation, last: Array, collisions: Array) -> MotionOb
     Args:
         obs: of the env, [..., R] and [..., G].
         last: [..., A] the action of that step, one-hot, or zeros before the first.
-        collisions: [...] bool, whether the robot stayed where it was; of moves alone it counts.
+        collisions: [...] bool, whether the robot was kept from moving; only moves count.
     """
     refused = collisions * (last[..., FORWARD] + last[..., BACKWARD])
     motion = jnp.concatenate([last, refused[..., None]], axis=-1)

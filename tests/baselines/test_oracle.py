@@ -25,6 +25,7 @@ from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluation import baseline_episodes
 from sqn_jax.evaluation.baseline_episodes import run_baseline
 from sqn_jax.evaluation.episodes import episode_keys, run_episodes
+from sqn_jax.evaluation.kept_paths import path_lengths
 from sqn_jax.evaluation.statistics import success_weighted_path_length
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
 from sqn_jax.storage.compile_cache import cached_programs
@@ -266,9 +267,9 @@ def test_plans_that_are_kept_are_not_searched_again_and_give_the_same_episodes(
 ) -> None:
     small, world = small_room()
 
-    def ahead(key: jax.Array = KEY, world: EnvParams = world) -> Any:
+    def ahead(key: jax.Array = KEY, world: EnvParams = world, on: OccupancyMap = small) -> Any:
         keys = episode_keys(key, 6)
-        navigator = baseline_episodes.oracle_ahead(keys, small, world)
+        navigator = baseline_episodes.oracle_ahead(keys, on, world)
         return run_baseline(keys, navigator, world, fields=("actions", "poses"))
 
     expected = ahead()
@@ -282,14 +283,47 @@ def test_plans_that_are_kept_are_not_searched_again_and_give_the_same_episodes(
             found.append(ahead())
     for each in found:
         jax.tree.map(np.testing.assert_array_equal, each, expected)
+    moved = small.occupied.copy()
+    moved[2, 2] = True  # A cell in a corner.
     with cached_programs():
         for other in (
             {"key": jax.random.key(12)},
             {"world": dataclasses.replace(world, max_steps=59)},
+            {"world": dataclasses.replace(world, goal_radius=jnp.float32(0.4))},
             {"world": make_env(small, EnvConfig(forward_speed=2.0))},
+            {"world": make_env(small, EnvConfig(robot_radius=0.12))},
+            {"on": dataclasses.replace(small, occupied=moved)},
         ):
             with pytest.raises(TypeError, match="not callable"):
                 ahead(**other)
+
+
+def test_path_lengths_that_are_kept_are_those_of_the_same_tasks_and_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, _ = small_room()
+    moved = small.occupied.copy()
+    moved[20:60, 40] = True
+    starts, goals = np.array([[1.0, 2.0, 0.0]] * 2), np.array([[5.0, 2.0], [4.0, 3.0]])
+    tasks: list[tuple[OccupancyMap, Any, Any, float]] = [
+        (small, starts, goals, 0.1),
+        (small, starts, goals[::-1], 0.1),
+        (small, starts + np.array([0.5, 0.0, 0.0]), goals, 0.1),
+        (small, starts, goals, 0.4),
+        (dataclasses.replace(small, occupied=moved), starts, goals, 0.1),
+    ]
+    expected = [
+        shortest_path_lengths(on, starts, goals, robot_radius=radius)
+        for on, starts, goals, radius in tasks
+    ]
+    assert len({tuple(lengths) for lengths in expected}) == 5
+    monkeypatch.setenv("SQN_JAX_CACHE", str(tmp_path / "kept"))
+    for _ in range(2):
+        with cached_programs():
+            for (on, starts, goals, radius), lengths in zip(tasks, expected, strict=True):
+                found = path_lengths(on, starts, goals, robot_radius=radius)
+                np.testing.assert_array_equal(found, lengths)
+    assert len(list((tmp_path / "kept").glob("arrays-paths-*-cache"))) == 5
 
 
 def test_oracle_mends_its_plan_under_noise() -> None:

@@ -190,9 +190,23 @@ def test_a_policy_with_motion_inputs_hears_of_moves_that_moved_nothing() -> None
     controller.set_scan(scan(), Mount(), 3.25)
     controller.tick(lambda: (x, 0.0, 0.0), 3.25)
     assert policy.seen[-1][4] is True  # type: ignore[misc]
+    controller.set_scan(scan(), Mount(), 3.2)
+    controller.tick(lambda: (x, 0.0, 0.0), 3.2)
+    assert policy.seen[-1][4] is False, "the clock went back"  # type: ignore[misc]
     controller.set_goal((9.0, 0.0))
     controller.tick(lambda: (x, 0.0, 0.0), 3.3)
     assert policy.seen[-1][4] is False  # type: ignore[misc]
+
+
+def test_a_move_is_refused_by_what_was_commanded_and_in_a_recording_never() -> None:
+    for obeyed, speed, expected in ((True, 0.5, True), (True, 0.1, False), (False, 0.5, False)):
+        policy = MotionPolicy()
+        controller = Controller(policy, Limits(max_speed=speed), obeyed=obeyed)
+        controller.set_goal((0.0, 30.0))
+        for time, x in ((0.0, 0.0), (0.5, 0.02)):  # 0.25 m were commanded, or 0.05 m.
+            controller.set_scan(scan(), Mount(), time)
+            controller.tick(lambda x=x: (x, 0.0, 0.0), time)  # type: ignore[misc]
+        assert [seen[4] for seen in policy.seen] == [False, expected]  # type: ignore[misc]
 
 
 def test_limits_are_checked() -> None:

@@ -86,13 +86,14 @@ def test_onnx_and_numpy_say_what_the_network_says(config: TrainConfig, tmp_path:
     ranges = rng.uniform(-0.5, 4, (20, 7))
     ranges[3, 2], ranges[3, 3], ranges[4, 0] = np.nan, np.inf, -np.inf
     distances, headings = rng.uniform(0, 12, 20), rng.uniform(-4 * np.pi, 4 * np.pi, 20)
+    distances[5:7] = 0, np.inf
     headings[:3] = 0, np.float32(np.pi), -np.float32(np.pi)
     # What the network sees of that, by the words of the docs.
     readings = np.where(np.isnan(ranges), 3.0, ranges)
     scaled = np.minimum(np.maximum(readings, 0), 3) / 3
     goal = [np.minimum(distances / 10, 1)]
     if config.env.goal_distance_encoding == "rational":
-        goal = [distances / (distances + 3)]
+        goal = [np.append(distances[:6] / (distances[:6] + 3), [1, *1 / (1 + 3 / distances[7:])])]
     if config.env.heading_encoding == "sincos":
         goal += [(np.sin(headings) + 1) / 2, (np.cos(headings) + 1) / 2]
     else:
@@ -187,9 +188,10 @@ def test_with_motion_inputs_a_policy_keeps_its_last_action_itself(
             before = np.zeros(13) if hidden is None else hidden
             np.testing.assert_allclose(by_numpy.step(obs, before)[0], expected, atol=tolerance)
             command, hidden = by_numpy.act(ranges, distance, heading, hidden, refused=refused)
-            action, state = by_jax.act(
-                Observation(shown[0][0], np.float32(shown[1][0])), state, refused=refused
-            )
+            obs_of_env = Observation(shown[0][0], np.float32(shown[1][0]))
+            with pytest.raises(ValueError, match="expected refused=False at first"):
+                by_jax.act(obs_of_env, state)
+            action, state = by_jax.act(obs_of_env, state, refused=refused)
             assert action == index[0] == expected.argmax()
             np.testing.assert_array_equal(command, by_numpy.commands[int(action)])
             for memory in (h_in[0, 0], hidden, state):
@@ -239,6 +241,32 @@ def test_a_folder_agrees_with_itself(exported: Path, capsys: pytest.CaptureFixtu
     distance = reference["observations"][0, -2]
     assert distance == pytest.approx(np.hypot(3.4, 2.4), rel=1e-5)
     assert np.abs(reference["observations"][:, -1]).max() <= np.float32(np.pi)
+
+
+def test_a_policy_that_hears_of_refused_moves_agrees_with_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It drives into a wall and goes on pushing."""
+    policy = random_policy(tiny(motion_inputs=True, goal_distance_encoding="rational"))
+    for skill in ("skill_0", "skill_1"):
+        policy.params[0]["params"][skill]["output"]["bias"] = jnp.float32([0, 99, 0, 0, 0])
+    write_policy(tmp_path, policy, {"evaluation": []})
+    arguments = ["export", str(tmp_path / "tiny.npz"), "--out", str(tmp_path / "robot")]
+    with compiling_quickly():
+        assert main([*arguments, "--map", str(write_empty_room(tmp_path))]) == 0
+    agreements = check_export(tmp_path / "robot")
+    assert [agreement.other_actions for agreement in agreements] == [0, 0]
+    reference = np.load(tmp_path / "robot" / "reference.npz")
+    assert reference["observations"].shape == (400, 10)
+    refused = reference["observations"][:, -1]
+    assert refused[0] == 0
+    assert set(refused[-100:]) == {1.0}
+    np.testing.assert_array_equal(reference["hidden"][0], np.zeros(13))
+    np.testing.assert_array_equal(reference["hidden"][1:, 8:], np.tile(np.eye(5)[1], (400, 1)))
+    card = (tmp_path / "robot" / "README.md").read_text()
+    assert "Inputs `obs` [1, 10]" in card
+    assert "policy.act(ranges, distance, heading, hidden, refused)" in card
+    assert "[1, 1, 13]" in card
 
 
 def test_the_graph_describes_its_robot(exported: Path) -> None:
@@ -301,6 +329,12 @@ def code(folder: Path) -> None:
     (folder / "sqn_policy.py").write_text("raise SystemExit('executed')\n")
 
 
+def an_older_version(folder: Path) -> None:
+    """It described its robot in fewer words."""
+    code(folder)
+    edit_config(folder, lambda data: data["robot"].pop("motion_inputs"))
+
+
 def no_graph(folder: Path) -> None:
     (folder / "policy.onnx").write_bytes(b"\x0a" * 100)
 
@@ -331,6 +365,7 @@ def short_rollout(folder: Path) -> None:
         (other_network, "params.safetensors: does not hold the"),
         (unknown_setting, "env.lidar_height is 1.0"),
         (code, "sqn_policy.py: is not that of this version"),
+        (an_older_version, "expected an export of this version"),
         (no_graph, "policy.onnx: no sound ONNX file"),
         (other_params, "params.safetensors: is of another policy"),
         (other_actions, "reference.npz: action "),

@@ -113,7 +113,12 @@ def test_agent_network_and_what_it_sees_are_those_of_the_policy_where_none_are_g
 ) -> None:
     config = TrainConfig(
         algo="r2d2",
-        env=EnvConfig(num_beams=31, goal_distance_encoding="rational", goal_distance_scale=7.0),
+        env=EnvConfig(
+            num_beams=31,
+            goal_distance_encoding="rational",
+            goal_distance_scale=7.0,
+            max_goal_distance=60.0,
+        ),
         network=NetworkConfig(hidden_size=8, motion_inputs=True),
     )
     params = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params_shapes(config))
@@ -128,14 +133,36 @@ def test_agent_network_and_what_it_sees_are_those_of_the_policy_where_none_are_g
     start = ["train", "--start-from", str(tmp_path / "mine.npz")]
     assert main([*start, "--env.max-range", "4"]) == 0
     assert main([*start, "--preset", "paper", "--network.hidden-size", "16"]) == 0
-    quick, paper = started
+    assert main([*start, "--env.goal-distance-scale", "9"]) == 0
+    quick, paper, scaled = started
     found = (quick.algo, quick.network, quick.env.num_beams, quick.env.goal_distance_encoding)
     assert found == ("r2d2", config.network, 31, "rational")
-    assert (quick.env.goal_distance_scale, quick.env.max_range) == (7.0, 4.0)
+    assert (quick.env.goal_distance_scale, quick.env.max_goal_distance) == (7.0, 60.0)
+    assert quick.env.max_range == 4.0
     assert quick.learner == PRESETS["quick"].learner
     assert (paper.network.hidden_size, paper.network.motion_inputs) == (16, True)
     assert _starting_policy(quick) is not None
+    assert scaled.env.goal_distance_scale == 9.0
+    assert _starting_policy(scaled) is not None
     with pytest.raises(ValueError, match=r"its network\.hidden_size is 8, here it is 16"):
         _starting_policy(paper)
-    (tmp_path / "mine.json").write_text("[]")
-    assert main(start) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[]", "lacks config"),
+        ('{"config": 5}', "config is 5"),
+        ('{"config": {"map": "nope:::"}}', "nope:::"),
+        ('{"config"', "JSON"),
+    ],
+)
+def test_settings_that_cannot_be_read_are_named(
+    text: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.json").write_text(text)
+    assert main(["train", "--start-from", str(tmp_path / "mine.npz")]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "mine.npz: cannot be read (" in line
+    assert told in line

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 
+from sqn_jax.storage import compile_cache
+from sqn_jax.storage import kept_arrays as kept
 from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.kept_arrays import code_of, kept_arrays
 
@@ -40,7 +44,8 @@ def test_what_is_kept_comes_back_with_its_types(folder: Path) -> None:
         for each in found:
             assert each[name].dtype == array.dtype
             np.testing.assert_array_equal(each[name], array)
-    assert [path.name[:6] for path in folder.glob("*-cache")] == ["plans-"]
+    (entry,) = folder.glob("*-cache")
+    assert entry.name.startswith("arrays-plans-")
 
 
 def test_what_depends_on_something_else_is_computed_anew(folder: Path) -> None:
@@ -87,6 +92,56 @@ def test_what_was_changed_is_not_read(folder: Path, damage: str, tmp_path: Path)
         assert make.calls == 3, "it was not kept again"
 
 
+def test_another_command_that_tidies_meanwhile_is_no_error(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before and after each of the two files, and all of the folder gone."""
+    write_whole = kept.write_whole
+
+    def tidied(path: Path, data: bytes) -> None:
+        compile_cache._tidy(folder)
+        write_whole(path, data)
+        compile_cache._tidy(folder)
+
+    def gone(path: Path, data: bytes) -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        write_whole(path, data)
+
+    make = Maker()
+    with cached_programs():
+        monkeypatch.setattr(kept, "write_whole", tidied)
+        kept_arrays("plans", [b"x"], make)
+        kept_arrays("plans", [b"x"], make)
+        assert make.calls == 1
+        monkeypatch.setattr(kept, "write_whole", gone)
+        np.testing.assert_array_equal(kept_arrays("plans", [b"y"], make)["a"], make()["a"])
+
+
+def test_what_is_too_large_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = Maker()
+    monkeypatch.setattr(kept, "LARGEST_FILE", 100)
+    with cached_programs():
+        for _ in range(2):
+            kept_arrays("plans", [b"x"], make)
+        assert make.calls == 2
+        assert not list(folder.glob("*-cache"))
+
+
+def test_arrays_have_a_limit_of_their_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest go; a program of another start stays."""
+    with cached_programs():
+        for part in (b"x", b"y"):
+            kept_arrays("plans", [part], Maker())
+        program = folder / "jit_f-1-cache"
+        program.write_bytes(b"program" * 1_000)
+        compile_cache.seal_of(program).write_bytes(compile_cache._digest(program))
+    arrays = sorted(folder.glob("arrays-*-cache"), key=lambda path: path.stat().st_mtime_ns)
+    os.utime(arrays[0], (1, 1))
+    monkeypatch.setattr(compile_cache, "LARGEST_ARRAYS", arrays[1].stat().st_size)
+    with cached_programs():
+        assert sorted(folder.glob("*-cache")) == sorted([arrays[1], program])
+
+
 def test_a_full_disk_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -97,7 +152,7 @@ def test_a_full_disk_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_other_code_is_something_else(tmp_path: Path) -> None:
-    modules = []
+    modules: list[ModuleType] = []
     for name, text in (("one", "x = 1\n"), ("two", "x = 2\n")):
         module = ModuleType(name)
         module.__file__ = str(tmp_path / f"{name}.py")

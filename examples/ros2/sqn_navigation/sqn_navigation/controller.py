@@ -100,8 +100,17 @@ def load_policy(folder: Path) -> Any:
 class Controller:
     """Drives one robot from goal to goal."""
 
-    def __init__(self, policy: Any, limits: Limits) -> None:
+    def __init__(self, policy: Any, limits: Limits, *, obeyed: bool = True) -> None:
+        """Nothing moves before there is a goal.
+
+        Args:
+            policy: from `load_policy`.
+            limits: what the robot allows.
+            obeyed: whether the robot drives as it is told. In a recording it does not: a robot that
+                stood then says nothing of a move that would be commanded now.
+        """
         self.policy = policy
+        self.obeyed = obeyed
         self.limits = limits
         self._goal: tuple[float, float] | None = None
         self._scan: Scan | None = None
@@ -164,6 +173,8 @@ class Controller:
             return Command(reason="the goal is reached")
         if self._ranges is None:  # A sensor that went blind stops a command that is held, too.
             self._ranges = self._seen(self._scan)
+        if now < self._decided:  # The clock went back a little.
+            self._decided_at = None
         if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
             self._command = self._decide(distance, heading, self._is_refused(here))
             self._decided, self._decided_at = now, here
@@ -180,8 +191,11 @@ class Controller:
         )
 
     def _is_refused(self, here: Pose) -> bool:
-        """Whether the last command was a move, of which the robot made less than a tenth."""
-        if self._decided_at is None:
+        """Whether the last command was a move, of which the robot made less than a tenth.
+
+        A command must hold for longer than poses are late, else each move seems to be refused.
+        """
+        if self._decided_at is None or not self.obeyed:
             return False
         commanded = abs(self._command.speed) * self.policy.time_step * self.limits.slowdown
         return math.dist(here[:2], self._decided_at[:2]) < commanded / 10
