@@ -41,7 +41,7 @@ def _quick() -> TrainConfig:
 
 
 def _best() -> TrainConfig:
-    """`quick` for ten times as long on generated maps of all kinds and their mirror images.
+    """`quick` with seven times the steps, on generated maps of all kinds and their mirror images.
 
     The Maze, the Column, the Forest and the Cave themselves are not among them. Most tasks come
     from maps on which about every other goal is reached.

@@ -22,8 +22,6 @@ from sqn_jax.env.navigation import BACKWARD, FORWARD
 from sqn_jax.env.prepare import commands_of
 from sqn_jax.export.description import observation_size, state_size
 
-MOVES = (FORWARD, BACKWARD)
-
 OPSET = 17
 IR_VERSION = 8
 """That of the time of opset 17: newer ones are refused by older runtimes."""
@@ -196,7 +194,9 @@ def _motion(graph: _Graph, memory: str, config: TrainConfig) -> list[str]:
     """The last action [1, A], and whether it was a move that was refused [1, 1]."""
     size, beams = config.network.hidden_size, config.env.num_beams
     last = _columns(graph, memory, size, state_size(config))
-    moves = [_columns(graph, memory, size + action, size + action + 1) for action in MOVES]
+    moves = [
+        _columns(graph, memory, size + action, size + action + 1) for action in (FORWARD, BACKWARD)
+    ]
     refused = _columns(graph, "obs", beams + 2, beams + 3)
     return [last, graph.node("Mul", refused, graph.node("Add", *moves))]
 

@@ -1,1 +1,1 @@
-"""What a run keeps on disk: its folder, checkpoints, and compiled programs."""
+"""What a run keeps on disk: its folder, checkpoints, compiled programs and kept arrays."""

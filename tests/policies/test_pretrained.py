@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +124,12 @@ def test_what_comes_with_the_package_can_be_read() -> None:
         leaves = jax.tree.leaves(found.params)
         assert leaves
         assert all(np.isfinite(leaf).all() for leaf in leaves)
+
+
+def test_nothing_that_only_run_folders_need_is_imported() -> None:
+    """Orbax takes a fifth of a second, which every evaluation of a pretrained policy would wait."""
+    code = (
+        "import sys, sqn_jax.cli.evaluate, sqn_jax.evaluation.compare, sqn_jax.policies.pretrained;"
+        "sys.exit(any(name.split('.')[0] == 'orbax' for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
