@@ -15,12 +15,13 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sqn_jax.baselines.beam import Beam, trace_back
 from sqn_jax.baselines.shortest_paths import ShortestPaths, wrapped_once
 from sqn_jax.env import EnvParams
 from sqn_jax.env.geometry import wrap_angle
@@ -70,7 +71,7 @@ class Oracle:
 
     @cached_property
     def search(self) -> BeamSearch:
-        """What plans, with the paths to all goals; a goal that occurs twice is computed once."""
+        """What plans. A goal that occurs twice is computed once."""
         return BeamSearch(*self._world, self.goals)
 
     def plans(self, poses: Floats) -> dict[str, NDArray[Any]]:
@@ -85,9 +86,9 @@ class Oracle:
         return {"actions": self.actions[:, :length], "planned": self.planned[:, :length]}
 
     def follow(self, actions: NDArray[np.int8], planned: NDArray[np.float32]) -> None:
-        """Go by plans that `plans` has made for the same robots, maybe of another oracle."""
-        length = actions.shape[1]
-        self.actions[:, :length], self.planned[:, :length] = actions, planned
+        """Go by what `plans` has returned for the same robots, maybe of another oracle."""
+        self.actions[:, : actions.shape[1]] = actions
+        self.planned[:, : actions.shape[1]] = planned
 
     def choose(self, poses: Floats) -> Ints:
         """Actions [E] for the robots at poses [E, 3]; one that has arrived stands still."""
@@ -140,27 +141,6 @@ def _require_plannable(occupancy_map: OccupancyMap, env_params: EnvParams) -> No
         )
     if min(config.forward_speed, config.backward_speed, config.turn_rate, config.time_step) <= 0:
         raise ValueError("the robot cannot move or turn, expected speeds above 0")
-
-
-class _Beam(NamedTuple):
-    """The poses that the search continues from, `P` for each of N robots, best first.
-
-    All have taken equally many steps. Rows of equal length make the search fast; those of a robot
-    with fewer poses are filled up with what is not valid.
-    """
-
-    parent: Ints
-    """[N, P] where in the row before they came from."""
-    action: NDArray[np.int8]
-    """[N, P] what led here; `STAND` at the start."""
-    pose: Floats
-    """[3, N, P] x, y, m, and heading, rad."""
-    turns: Ints
-    """[N, P] turns to the left since the start, less whole circles: the heading unrounded."""
-    cell: Ints
-    """[N, P] number of the cell: row times columns plus column."""
-    valid: NDArray[np.bool_]
-    """[N, P]."""
 
 
 class BeamSearch:
@@ -217,7 +197,7 @@ class BeamSearch:
             left, inside = self._steps_left(following, robots[searching])
             best, valid = self._select(following, left, width)
             rows = np.arange(len(searching))[:, None]
-            beam = _Beam._make(each[..., rows, best] for each in following)._replace(valid=valid)
+            beam = Beam._make(each[..., rows, best] for each in following)._replace(valid=valid)
             beams.append((searching, beam))
             arrived = inside[rows[:, 0], best[:, 0]]
             reached[searching[arrived]] = True
@@ -225,16 +205,16 @@ class BeamSearch:
                 break
             if arrived.any():
                 searching = searching[~arrived]
-                beam = _Beam._make(
+                beam = Beam._make(
                     each[:, ~arrived] if each.ndim == 3 else each[~arrived] for each in beam
                 )
         return [
-            (*_trace_back(beams, robot), bool(is_there)) for robot, is_there in enumerate(reached)
+            (*trace_back(beams, robot), bool(is_there)) for robot, is_there in enumerate(reached)
         ]
 
-    def _start(self, poses: Floats) -> _Beam:
+    def _start(self, poses: Floats) -> Beam:
         zeros = np.zeros((len(poses), 1), np.int64)
-        return _Beam(
+        return Beam(
             parent=zeros,
             action=zeros.astype(np.int8),
             pose=poses.T[..., None],
@@ -243,7 +223,7 @@ class BeamSearch:
             valid=zeros == 0,
         )
 
-    def _expand(self, beam: _Beam, robots: Ints) -> _Beam:
+    def _expand(self, beam: Beam, robots: Ints) -> Beam:
         """All poses one step on from those of a beam; no step straight back.
 
         Args:
@@ -275,7 +255,7 @@ class BeamSearch:
             same = _is_at(np.moveaxis(beam.pose[:, row], 0, -1), refused_at)
             valid[row, MOVES.index(action)] &= ~same
         everyone = (num_robots, len(MOVES) * width)
-        return _Beam(
+        return Beam(
             parent=np.broadcast_to(np.tile(np.arange(width), len(MOVES)), everyone),
             action=np.broadcast_to(np.repeat(np.array(MOVES, np.int8), width), everyone),
             pose=pose.reshape(3, *everyone),
@@ -284,7 +264,7 @@ class BeamSearch:
             valid=valid.reshape(everyone),
         )
 
-    def _steps_left(self, beam: _Beam, robots: Ints) -> tuple[Floats, NDArray[np.bool_]]:
+    def _steps_left(self, beam: Beam, robots: Ints) -> tuple[Floats, NDArray[np.bool_]]:
         """Estimated steps to the goal, less than all others at the goal, and who is there."""
         robots = robots[:, None]
         left = self.paths.steps_left_in(beam.cell, robots, beam.pose, self.forward, self.backward)
@@ -296,7 +276,7 @@ class BeamSearch:
         return left, inside
 
     def _select(
-        self, beam: _Beam, left: Floats, width: int
+        self, beam: Beam, left: Floats, width: int
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """The `width` best poses of each robot, best first, one for each cell and heading.
 
@@ -392,20 +372,3 @@ def _is_at(pose: Floats, planned: NDArray[np.floating]) -> Any:
     away = pose - planned
     away[..., 2] = wrap_angle(away[..., 2])
     return np.abs(away).max(axis=-1) < ON_PLAN
-
-
-def _trace_back(beams: list[tuple[Ints, _Beam]], robot: int) -> tuple[Ints, Floats]:
-    """Actions of a robot, and the poses before them, that led to its best pose at last.
-
-    Args:
-        beams: for each step whose rows the beam has, ascending, and the beam.
-        robot: whose actions.
-    """
-    last = next(i for i in range(len(beams) - 1, -1, -1) if robot in beams[i][0])
-    actions, poses, index = [], [], 0
-    for step in range(last, 0, -1):
-        row, row_before = (np.searchsorted(beams[i][0], robot) for i in (step, step - 1))
-        actions.append(beams[step][1].action[row, index])
-        index = beams[step][1].parent[row, index]
-        poses.append(beams[step - 1][1].pose[:, row_before, index])
-    return np.array(actions[::-1], np.int64), np.array(poses[::-1]).reshape(-1, 3)

@@ -28,6 +28,7 @@ from sqn_jax.config import EnvConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams, EnvState, Observation
 from sqn_jax.env.navigation import STAND
 from sqn_jax.env.several_maps import select_maps, without_spawn_points
+from sqn_jax.evaluation.cached_paths import prepared_oracle
 from sqn_jax.evaluation.episodes import (
     BATCH,
     EpisodeResults,
@@ -37,7 +38,6 @@ from sqn_jax.evaluation.episodes import (
     step_by_hand,
     task_metrics,
 )
-from sqn_jax.evaluation.kept_paths import prepared_oracle
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.training.rollout import ActorState, EpisodeMetrics, step_actors, with_ends
 

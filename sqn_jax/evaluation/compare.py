@@ -20,8 +20,8 @@ from sqn_jax.baselines.shortest_paths import has_paths, require_paths
 from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, EpisodeBatch, OnBatch, TrainedAgent
+from sqn_jax.evaluation.cached_paths import path_lengths
 from sqn_jax.evaluation.episodes import EpisodeResults
-from sqn_jax.evaluation.kept_paths import path_lengths
 from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.training import memory_budget

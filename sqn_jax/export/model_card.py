@@ -187,9 +187,9 @@ def _failures(config: TrainConfig, results: Sequence[Result]) -> str:
 
 
 def _use(config: TrainConfig) -> str:
-    told, call = "", "ranges, distance, heading, hidden"
+    more, call = "", "ranges, distance, heading, hidden"
     if config.network.motion_inputs:
-        told = (
+        more = (
             " At the end of `obs` stands 1 if the last command\n  was a move and the robot did not "
             "move, else 0; `h_in` holds the last action, too."
         )
@@ -199,7 +199,7 @@ def _use(config: TrainConfig) -> str:
 - `policy.onnx`: any ONNX runtime, opset 17. Inputs `obs` [1, {observation_size(config)}], ranges in
   m, the goal's distance in m and heading in rad, and `h_in` [1, 1, {state_size(config)}], zeros at
   each new goal; outputs `actions` [[m/s, rad/s]], `action_index`, `q_values`, `skill_weights`,
-  `h_out`.{told} The order of the beams, the commands and all else that a robot needs are
+  `h_out`.{more} The order of the beams, the commands and all else that a robot needs are
   in its metadata. Ranges may be infinite or NaN where nothing is hit. With value rescaling,
   Q-values are those of the rescaled return.
 - `sqn_policy.py` with `params.safetensors` and `config.json`: Python 3.8 and NumPy:

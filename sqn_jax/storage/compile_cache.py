@@ -34,7 +34,7 @@ LARGEST_BYTES = 2**28
 """What the folder may hold when a run starts; all programs of a run take a few MB."""
 
 LARGEST_ARRAYS = 2**26
-"""What the arrays beside the programs may take (`kept_arrays`)."""
+"""What the arrays beside the programs may take (`cached_arrays`)."""
 
 ARRAYS = "arrays-"
 """How the names of files with arrays begin."""

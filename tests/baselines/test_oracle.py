@@ -24,8 +24,8 @@ from sqn_jax.env.dynamics import move
 from sqn_jax.env.navigation import FORWARD, MOTION_ITERATIONS, STAND
 from sqn_jax.evaluation import baseline_episodes
 from sqn_jax.evaluation.baseline_episodes import run_baseline
+from sqn_jax.evaluation.cached_paths import path_lengths
 from sqn_jax.evaluation.episodes import episode_keys, run_episodes
-from sqn_jax.evaluation.kept_paths import path_lengths
 from sqn_jax.evaluation.statistics import success_weighted_path_length
 from sqn_jax.maps import OccupancyMap, goal_distance, load_map, points_to_cells, traversable
 from sqn_jax.storage.compile_cache import cached_programs

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sqn_jax.baselines import oracle, shortest_paths
+from sqn_jax.baselines import beam, oracle, shortest_paths
 from sqn_jax.baselines.oracle import Oracle
 from sqn_jax.env import EnvParams, geometry, navigation
 from sqn_jax.maps import OccupancyMap, distance, occupancy
-from sqn_jax.storage.kept_arrays import code_of, kept_arrays
+from sqn_jax.storage.array_cache import cached_arrays, code_of
 
 _PATHS_CODE = code_of(shortest_paths, distance, occupancy, geometry)
-_PLANS_CODE = _PATHS_CODE + code_of(oracle, navigation)
+_PLANS_CODE = _PATHS_CODE + code_of(oracle, beam, navigation)
 
 Floats = NDArray[np.floating]
 
@@ -29,7 +29,7 @@ def prepared_oracle(
     ]
     depends_on = [_PLANS_CODE, *_contents(occupancy_map), repr(robot).encode()]
     depends_on += [goals.tobytes(), poses.tobytes()]
-    plans = kept_arrays("plans", depends_on, lambda: planner.plans(poses.astype(np.float64)))
+    plans = cached_arrays("plans", depends_on, lambda: planner.plans(poses.astype(np.float64)))
     planner.follow(**plans)
     return planner
 
@@ -47,7 +47,7 @@ def path_lengths(
 
     depends_on = [_PATHS_CODE, *_contents(occupancy_map), repr(robot_radius).encode()]
     depends_on += [starts.tobytes(), goals.tobytes()]
-    return kept_arrays("paths", depends_on, searched)["lengths"]
+    return cached_arrays("paths", depends_on, searched)["lengths"]
 
 
 def _contents(occupancy_map: OccupancyMap) -> list[bytes]:

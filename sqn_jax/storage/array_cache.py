@@ -27,7 +27,7 @@ LARGEST_FILE = 2**24
 """Bytes of a file; what is larger is not kept."""
 
 
-def kept_arrays(
+def cached_arrays(
     kind: str,
     depends_on: Iterable[bytes],
     make: Callable[[], Mapping[str, NDArray[Any]]],

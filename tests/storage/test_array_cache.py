@@ -10,10 +10,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sqn_jax.storage import compile_cache
-from sqn_jax.storage import kept_arrays as kept
+from sqn_jax.storage import array_cache, compile_cache
+from sqn_jax.storage.array_cache import cached_arrays, code_of
 from sqn_jax.storage.compile_cache import cached_programs
-from sqn_jax.storage.kept_arrays import code_of, kept_arrays
 
 
 class Maker:
@@ -38,7 +37,7 @@ def test_what_is_kept_comes_back_with_its_types(folder: Path) -> None:
     found = []
     for _ in range(2):  # Two commands.
         with cached_programs():
-            found.append(kept_arrays("plans", [b"map", b"robot"], make))
+            found.append(cached_arrays("plans", [b"map", b"robot"], make))
     assert make.calls == 1
     for name, array in make().items():
         for each in found:
@@ -53,8 +52,8 @@ def test_what_depends_on_something_else_is_computed_anew(folder: Path) -> None:
     with cached_programs():
         # The same bytes, divided otherwise, are something else, too.
         for parts in ([b"ab", b"c"], [b"a", b"bc"], [b"abc"], [b"ab", b"c"]):
-            kept_arrays("plans", parts, make)
-        kept_arrays("paths", [b"abc"], make)
+            cached_arrays("plans", parts, make)
+        cached_arrays("paths", [b"abc"], make)
     assert make.calls == 4
 
 
@@ -62,10 +61,10 @@ def test_nothing_is_kept_where_no_programs_are(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make = Maker()
-    kept_arrays("plans", [b"x"], make)
+    cached_arrays("plans", [b"x"], make)
     monkeypatch.setenv("SQN_JAX_CACHE", "off")
     with cached_programs():
-        kept_arrays("plans", [b"x"], make)
+        cached_arrays("plans", [b"x"], make)
     assert make.calls == 2
     assert not folder.exists()
 
@@ -74,7 +73,7 @@ def test_nothing_is_kept_where_no_programs_are(
 def test_what_was_changed_is_not_read(folder: Path, damage: str, tmp_path: Path) -> None:
     make = Maker()
     with cached_programs():
-        kept_arrays("plans", [b"x"], make)
+        cached_arrays("plans", [b"x"], make)
         (entry,) = folder.glob("*-cache")
         data = bytearray(entry.read_bytes())
         if damage == "flipped":
@@ -86,9 +85,9 @@ def test_what_was_changed_is_not_read(folder: Path, damage: str, tmp_path: Path)
             entry.symlink_to(tmp_path / "elsewhere")
         else:  # A process was killed before it was sealed.
             next(folder.glob("*-sha256")).unlink()
-        np.testing.assert_array_equal(kept_arrays("plans", [b"x"], make)["a"], make()["a"])
+        np.testing.assert_array_equal(cached_arrays("plans", [b"x"], make)["a"], make()["a"])
         assert make.calls == 3
-        kept_arrays("plans", [b"x"], make)
+        cached_arrays("plans", [b"x"], make)
         assert make.calls == 3, "it was not kept again"
 
 
@@ -96,7 +95,7 @@ def test_another_command_that_tidies_meanwhile_is_no_error(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before and after each of the two files, and all of the folder gone."""
-    write_whole = kept.write_whole
+    write_whole = array_cache.write_whole
 
     def tidied(path: Path, data: bytes) -> None:
         compile_cache._tidy(folder)
@@ -109,20 +108,20 @@ def test_another_command_that_tidies_meanwhile_is_no_error(
 
     make = Maker()
     with cached_programs():
-        monkeypatch.setattr(kept, "write_whole", tidied)
-        kept_arrays("plans", [b"x"], make)
-        kept_arrays("plans", [b"x"], make)
+        monkeypatch.setattr(array_cache, "write_whole", tidied)
+        cached_arrays("plans", [b"x"], make)
+        cached_arrays("plans", [b"x"], make)
         assert make.calls == 1
-        monkeypatch.setattr(kept, "write_whole", gone)
-        np.testing.assert_array_equal(kept_arrays("plans", [b"y"], make)["a"], make()["a"])
+        monkeypatch.setattr(array_cache, "write_whole", gone)
+        np.testing.assert_array_equal(cached_arrays("plans", [b"y"], make)["a"], make()["a"])
 
 
 def test_what_is_too_large_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = Maker()
-    monkeypatch.setattr(kept, "LARGEST_FILE", 100)
+    monkeypatch.setattr(array_cache, "LARGEST_FILE", 100)
     with cached_programs():
         for _ in range(2):
-            kept_arrays("plans", [b"x"], make)
+            cached_arrays("plans", [b"x"], make)
         assert make.calls == 2
         assert not list(folder.glob("*-cache"))
 
@@ -131,7 +130,7 @@ def test_arrays_have_a_limit_of_their_own(folder: Path, monkeypatch: pytest.Monk
     """The oldest go; a program of another start stays."""
     with cached_programs():
         for part in (b"x", b"y"):
-            kept_arrays("plans", [part], Maker())
+            cached_arrays("plans", [part], Maker())
         program = folder / "jit_f-1-cache"
         program.write_bytes(b"program" * 1_000)
         compile_cache.seal_of(program).write_bytes(compile_cache._digest(program))
@@ -146,9 +145,9 @@ def test_a_full_disk_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sqn_jax.storage.kept_arrays.write_whole", full)
+    monkeypatch.setattr("sqn_jax.storage.array_cache.write_whole", full)
     with cached_programs():
-        assert kept_arrays("plans", [b"x"], Maker()).keys() == {"a", "b"}
+        assert cached_arrays("plans", [b"x"], Maker()).keys() == {"a", "b"}
 
 
 def test_other_code_is_something_else(tmp_path: Path) -> None:
