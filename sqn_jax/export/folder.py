@@ -11,7 +11,6 @@ SHA256SUMS          digests of all these
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import shutil
@@ -32,6 +31,7 @@ from sqn_jax.export.safetensors_file import to_safetensors
 from sqn_jax.outside.messages import named
 from sqn_jax.policies.greedy import GreedyPolicy
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.storage.arrays import packed_arrays
 from sqn_jax.storage.files import NotWritten, write_whole
 
 ONNX, PARAMS, CONFIG = "policy.onnx", "params.safetensors", "config.json"
@@ -111,14 +111,12 @@ def export_contents(policy: Policy, card: str, map_name: str) -> dict[str, bytes
     graph = policy_graph(policy.config, arrays, onnx_description(description))
     acting = GreedyPolicy(policy.name, policy.config, policy.params[0])
     rollout = reference_rollout(acting, map_name)
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **rollout)
     contents = {
         ONNX: graph.SerializeToString(deterministic=True),
         PARAMS: packed,
         CONFIG: (json.dumps(description, indent=2, allow_nan=False) + "\n").encode(),
         RUNTIME: runtime_source(),
-        REFERENCE: file.getvalue(),
+        REFERENCE: packed_arrays(rollout),
         CARD: card.encode(),
     }
     return contents | {SUMS: sums_text(contents).encode()}

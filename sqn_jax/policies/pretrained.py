@@ -6,7 +6,6 @@ Those that come with the package are named `pretrained:NAME`.
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +21,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.outside.messages import one_line
 from sqn_jax.outside.reading import read_at_most, read_json
 from sqn_jax.policies.run_policies import Policy, WhichParams, load_policy, require_finite
-from sqn_jax.storage.arrays import MAX_HEADER_BYTES, read_arrays, read_headers
+from sqn_jax.storage.arrays import MAX_HEADER_BYTES, packed_arrays, read_arrays, read_headers
 from sqn_jax.storage.files import write_json, write_whole
 from sqn_jax.storage.run_folder import RunFolder
 from sqn_jax.training.state import params_shapes
@@ -172,10 +171,7 @@ def write_policy(folder: Path, policy: Policy, card: Mapping[str, Any], *, index
     config = configs.to_public_dict(policy.config)
     config |= {"seed": policy.training_seeds[index], "num_seeds": 1}
     flat = traverse_util.flatten_dict(policy.params[index], sep="/")
-    file = io.BytesIO()
-    arrays = {path: np.asarray(array) for path, array in flat.items()}
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    packed = file.getvalue()
+    packed = packed_arrays({path: np.asarray(array) for path, array in flat.items()})
     write_whole(folder / f"{policy.name}.npz", packed)
     digest = hashlib.sha256(packed).hexdigest()
     write_json(folder / f"{policy.name}.json", {"card": card, "config": config, "sha256": digest})

@@ -7,7 +7,6 @@ executed.
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sqn_jax.outside.reading import read_at_most
-from sqn_jax.storage.arrays import read_arrays, read_headers
+from sqn_jax.storage.arrays import packed_arrays, read_arrays, read_headers
 from sqn_jax.storage.compile_cache import ARRAYS, ENTRY, folder_in_use, seal_of
 from sqn_jax.storage.files import write_whole
 
@@ -52,9 +51,7 @@ def cached_arrays(
         if read_at_most(seal, 64, "a checksum", follow=False) == _checksum(packed):
             return read_arrays(packed, read_headers(packed))
     arrays = dict(make())
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    packed = file.getvalue()
+    packed = packed_arrays(arrays)
     if len(packed) <= LARGEST_FILE:
         with suppress(OSError, ValueError):
             # The checksum first: what has none is deleted by the next command that starts.

@@ -1,4 +1,4 @@
-"""Reading files of arrays (.npz) from outside: nothing is unpacked before its size is known."""
+"""Files of arrays (.npz): of one from outside nothing is unpacked before its size is known."""
 
 from __future__ import annotations
 
@@ -63,3 +63,10 @@ def read_arrays(packed: bytes, headers: Mapping[str, Header]) -> dict[str, Any]:
     except Exception as error:  # As above.
         raise ValueError(f"no sound .npz file: {error}") from None
     return arrays
+
+
+def packed_arrays(arrays: Mapping[str, Any]) -> bytes:
+    """The contents of a .npz file."""
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
