@@ -12,6 +12,7 @@ from sqn_jax.outside.messages import say
 
 if TYPE_CHECKING:
     from sqn_jax.tasks import TaskSuite
+    from sqn_jax.tasks.convert import ConvertedMap
 
 
 def tasks(arguments: list[str]) -> int:
@@ -24,6 +25,8 @@ def tasks(arguments: list[str]) -> int:
     require_output(options.out)
     if options.action == "generate":
         return _generate(options)
+    if options.action == "pairs":
+        return _pairs(options)
     return _convert(options)
 
 
@@ -73,6 +76,19 @@ def _parser() -> Parser:
     generate.add_argument("--count", type=int, default=1000, help="maps of each kind (1000)")
     generate.add_argument("--seed", type=int, default=1_000_000, help="of the first map (1000000)")
     generate.add_argument("--num-processes", type=int, help="default: one for each core")
+    pairs = action("pairs", "random pairs of places on maps of your own")
+    pairs.add_argument("maps", nargs="+", metavar="MAP", help="files, or names of single maps")
+    pairs.add_argument("--count", type=int, default=50, help="tasks of each map (50)")
+    pairs.add_argument("--seed", type=int, default=0, help="of the tasks (0)")
+    pairs.add_argument("--robot-radius", type=float, default=0.1, help="m (0.1)")
+    pairs.add_argument(
+        "--limit", type=float, default=4.0, help="steps, in those of the shortest path (4)"
+    )
+    pairs.add_argument(
+        "--allow-outside",
+        action="store_true",
+        help="let a map name an image that lies outside its folder",
+    )
     check = action("check", "whether a suite can be read and its tasks solved", "FILE.json")
     check.add_argument(
         "--allow-outside",
@@ -115,6 +131,40 @@ def _generate(options: argparse.Namespace) -> int:
     total = options.count * len(options.kinds)
     suite = TaskSuite(options.out.stem, tuple(tqdm(made, total=total, unit="map", disable=None)))
     write_suite(options.out, suite)
+    _report(options.out, suite)
+    return 0
+
+
+def _pairs(options: argparse.Namespace) -> int:
+    """Write a suite of random pairs of places."""
+    import dataclasses
+
+    from sqn_jax.config.groups import EnvConfig
+    from sqn_jax.maps import load_map
+    from sqn_jax.tasks.convert import write_converted
+    from sqn_jax.tasks.pairs import random_tasks
+
+    robot_radius = EnvConfig(robot_radius=options.robot_radius).robot_radius
+
+    def converted(name: str) -> ConvertedMap:
+        occupancy_map = load_map(
+            name, robot_radius=robot_radius, allow_outside=options.allow_outside
+        )
+        if occupancy_map.parts:
+            raise ValueError(f"map {name}: several maps, expected one; name them one by one")
+        drawn = random_tasks(
+            occupancy_map,
+            options.count,
+            options.seed,
+            robot_radius=robot_radius,
+            limit=options.limit,
+        )
+        file_name = occupancy_map.name.replace(":", "_")
+        named_so = dataclasses.replace(occupancy_map, name=file_name)
+        return dataclasses.replace(drawn, occupancy_map=named_so)
+
+    robot = (("robot_radius", robot_radius),)
+    suite = write_converted(options.out, map(converted, options.maps), robot=robot)
     _report(options.out, suite)
     return 0
 
