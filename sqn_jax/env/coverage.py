@@ -28,7 +28,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.env.arithmetic import fraction, larger, smaller, to_integer
-from sqn_jax.env.loops import repeat
+from sqn_jax.env.loops import repeat, traced_once
 
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 LATTICE_ANGLE = math.atan(GOLDEN_RATIO)
@@ -139,6 +139,7 @@ def area(covered: Array, cell: float) -> Array:
     return jax.lax.population_count(covered).astype(jnp.int32).sum() * cell**2
 
 
+@partial(traced_once, static_argnames=("field_of_view", "lattice"))
 def add_scan(
     covered: Array, pose: Array, ranges: Array, *, field_of_view: float, lattice: Lattice
 ) -> tuple[Array, Array]:

@@ -1,14 +1,19 @@
-"""Short loops, written out where starting a kernel is what takes time."""
+"""Short loops, written out where starting a kernel is what takes time, and traced but once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import jax
 from jax import Array
 
 Carry = TypeVar("Carry")
+
+traced_once = partial(jax.jit, inline=True)
+"""For what is written out at length: a process traces it once, not for each program anew. The
+programs are the same."""
 
 
 def repeat(

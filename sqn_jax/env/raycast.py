@@ -6,6 +6,8 @@ rays that need more hops than `iterations`: those are cut short, never too long.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -13,7 +15,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from sqn_jax.env.arithmetic import fraction, larger, smaller, to_integer
-from sqn_jax.env.loops import repeat
+from sqn_jax.env.loops import repeat, traced_once
 
 
 @struct.dataclass
@@ -90,6 +92,7 @@ def cast_fan(
     return _hop(grid, pose[:2], directions, max_range, iterations, unroll=1)[:count]
 
 
+@partial(traced_once, static_argnames=("iterations", "unroll"))
 def _hop(
     grid: RayGrid,
     position: Array,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -34,11 +34,13 @@ from sqn_jax.tasks.suite import Task, TaskSuite
 from sqn_jax.training import memory_budget
 from sqn_jax.training.devices import num_cores
 
+Item = TypeVar("Item")
+
 LoadMap = Callable[[str], OccupancyMap]
 """Makes a map of `Task.map_file`; the same for the same name."""
 
 CELLS_AT_ONCE = 2**22
-"""Cells of the maps of a chunk, unless a single map has more: tables of 0.3 GB."""
+"""Cells of the maps of a chunk, unless a single map has more: tables of 0.3 GB, of two chunks."""
 
 EPISODE_STREAM = 2
 """Which of the streams of an evaluation seed the episodes of a suite follow; drawn tasks have 0
@@ -116,7 +118,7 @@ def evaluate_suite(
     tables = {agent.name: suite_scores.empty_table(agent, suite, settings) for agent in agents}
     robots = {agent.name: robot_for(agent.env_config, suite) for agent in agents}
     for robot in dict.fromkeys(robots.values()):
-        for chunk in chunks(suite, robot, maps[robot.robot_radius], settings.noise):
+        for chunk in one_ahead(chunks(suite, robot, maps[robot.robot_radius], settings.noise)):
             memory_budget.bound_programs()
             for agent in agents:
                 if robots[agent.name] == robot:
@@ -178,6 +180,18 @@ def chunks(
             shortest_paths=_shortest_paths(tasks, given, maps, robot.robot_radius),
             collision_ends=suite.collision_ends,
         )
+
+
+def one_ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """The same items; while one is in use, a thread makes the next."""
+    thread = ThreadPoolExecutor(1)
+    try:
+        coming = thread.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = thread.submit(next, items, None)
+            yield item
+    finally:
+        thread.shutdown(wait=False, cancel_futures=True)
 
 
 def _groups(cells: dict[str, int]) -> Iterator[list[str]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -351,3 +353,32 @@ def test_what_cannot_be_evaluated_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_chunk_is_made_while_the_one_before_is_used() -> None:
+    made: list[int] = []
+    second_is_made = threading.Event()
+
+    def items() -> Iterator[int]:
+        for item in (1, 2, 3):
+            made.append(item)
+            if item == 2:
+                second_is_made.set()
+            yield item
+
+    ahead = suites.one_ahead(items())
+    assert next(ahead) == 1
+    assert second_is_made.wait(10), "while the first is used"
+    assert 3 not in made, "no more than one"
+    assert list(ahead) == [2, 3]
+
+
+def test_what_goes_wrong_ahead_is_said_in_its_turn() -> None:
+    def items() -> Iterator[int]:
+        yield 1
+        raise ValueError("the second map")
+
+    ahead = suites.one_ahead(items())
+    assert next(ahead) == 1
+    with pytest.raises(ValueError, match="the second map"):
+        next(ahead)
