@@ -2,6 +2,7 @@
 
 DIR holds suites of tasks (`sqn tasks`), one JSON file each. Every policy and the wall follower try
 each task under the evaluation seeds; the oracle, which plans for long, tries the first tasks only.
+`--no-baselines` leaves both out, where they are on record for the suite.
 Suites in which a collision ends an episode get the score of the BARN challenge beside their
 success. Maps are ranked by every other try and judged by the rest; with one evaluation seed the
 worst tenth reads too low. All of it is kinematic, and no entry of any leaderboard.
@@ -84,6 +85,7 @@ def main() -> None:
     parser.add_argument("--policies", nargs="+", help="default: those that come with the package")
     parser.add_argument("--eval-seeds", type=int, default=5)
     parser.add_argument("--oracle-tasks", type=int, default=50, help="of each suite (default 50)")
+    parser.add_argument("--no-baselines", action="store_true", help="the policies alone")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     files = sorted(options.folder.glob("*.json"))
@@ -96,10 +98,12 @@ def main() -> None:
     suites: dict[str, Any] = {}
     for file in files:
         suite = read_suite(file)
-        rows = evaluate([*policies, BaselineAgent("bug", robot)], suite, file, settings)
-        some = dataclasses.replace(suite, tasks=suite.tasks[: options.oracle_tasks])
-        once = dataclasses.replace(settings, eval_seeds=1)
-        rows += evaluate([BaselineAgent("oracle", robot)], some, file, once)
+        bug = [] if options.no_baselines else [BaselineAgent("bug", robot)]
+        rows = evaluate([*policies, *bug], suite, file, settings)
+        if not options.no_baselines:
+            some = dataclasses.replace(suite, tasks=suite.tasks[: options.oracle_tasks])
+            once = dataclasses.replace(settings, eval_seeds=1)
+            rows += evaluate([BaselineAgent("oracle", robot)], some, file, once)
         suites[suite.name] = rows
         # What has been evaluated is not lost if the rest is broken off.
         write_json(options.out, {"published": {"barn": PUBLISHED}, "suites": suites})

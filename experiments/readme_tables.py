@@ -18,48 +18,44 @@ from typing import Any
 
 from experiments import bench_breakdown, bench_learner, bench_simulator, bench_train
 from experiments.common import recorded, run
+from experiments.entries import Entry, mean, mean_and_spread, one_of, results_of, spread, steps
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
+from experiments.suite_tables import best, external, fresh
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.statistics import sample_std
-from sqn_jax.evaluation.suite_scores import worst_tenth
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (
-    "README.md",
-    *(f"docs/{name}.md" for name in ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT")),
-)
+DOCS = ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT")
+PAGES = ("README.md", *(f"docs/{name}.md" for name in DOCS))
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
 """Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
-RADIUS = 0.3
 BENCHMARK = "benchmark.json"
 STARTS = ("start_smoke.json", "start_evaluate.json", "start_render.json")
-
-Entry = dict[str, Any]
 
 
 def agents() -> str:
     """Three agents trained alike on the Maze, each above the paper's: success and time steps."""
-    entries = _results("pretrained_table.json")
+    entries = results_of("pretrained_table.json")
     rows = []
     for agent, algorithm in ALIKE.items():
-        ours = [_one(entries, agent, name) for name in PAPER_MAPS]
-        rows.append([NAMES[algorithm], *(f"{_mean(each)}, {_steps(each)}" for each in ours)])
+        ours = [one_of(entries, agent, name) for name in PAPER_MAPS]
+        rows.append([NAMES[algorithm], *(f"{mean(each)}, {steps(each)}" for each in ours)])
         rows.append(_paper_row(algorithm))
     return markdown_table(["success, time steps", *PAPER_MAPS], rows)
 
 
 def policies() -> str:
     """The policies that come with the package, and the baselines: success and time steps."""
-    entries = _results("pretrained_table.json")
+    entries = results_of("pretrained_table.json")
     labels = {
         **{agent: f"`pretrained:{algorithm}`" for agent, algorithm in ALIKE.items()},
         **{"sqn best": "`pretrained:best`", "bug": "bug", "oracle": "oracle"},
     }
     rows = [
-        [label, *(_in_full(_one(entries, agent, name)) for name in PAPER_MAPS)]
+        [label, *(_in_full(one_of(entries, agent, name)) for name in PAPER_MAPS)]
         for agent, label in labels.items()
     ]
     rows += [_paper_row(algorithm) for algorithm in NAMES]
@@ -84,11 +80,11 @@ def paper_half() -> str:
     rows = []
     for algorithm, label in NAMES.items():
         for params in ("latest", "target"):
-            entries = _results(f"paper_half_{params}.json")
-            entries += _results(f"paper_half_pairs_{params}.json")
+            entries = results_of(f"paper_half_{params}.json")
+            entries += results_of(f"paper_half_pairs_{params}.json")
             names = [algorithm, *(f"{algorithm}, epsilon {epsilon}" for epsilon in (0.05, 0.1))]
             cells = [
-                " / ".join(_mean(_one(entries, agent, name, tasks=tasks)) for agent in names)
+                " / ".join(mean(one_of(entries, agent, name, tasks=tasks)) for agent in names)
                 for name, tasks in columns
             ]
             rows.append([f"{label}, {params}", *cells])
@@ -100,22 +96,22 @@ def paper_half() -> str:
 
 def dead_ends() -> str:
     """Agents trained on the Maze and twelve caves: success of each training seed."""
-    entries = _results("caves_horizon_table.json")
+    entries = results_of("caves_horizon_table.json")
     rows = []
     for agent, label in NAMES.items():
-        scores = [_one(entries, agent, name)["success_per_seed"] for name in ("maze", "cave")]
+        scores = [one_of(entries, agent, name)["success_per_seed"] for name in ("maze", "cave")]
         rows.append([label, *(", ".join(f"{score:.3f}" for score in each) for each in scores)])
     return markdown_table(["", "maze", "cave"], rows)
 
 
 def noise() -> str:
     """Success in the maze under the paper's noise."""
-    three = _results("pretrained_noise.json")
-    best = _results("best_noise.json")
+    three = results_of("pretrained_noise.json")
+    best = results_of("best_noise.json")
     header = ["", "none", *(f"velocity {level:g}" for level in VELOCITY_NOISE)]
     header += [f"range {100 * level:.0f} %" for level in RANGE_NOISE]
     rows = [
-        [label, *(_mean(_one(entries, agent, "maze", noise=level)) for level in LEVELS)]
+        [label, *(mean(one_of(entries, agent, "maze", noise=level)) for level in LEVELS)]
         for label, entries, agent in (
             *((f"`pretrained:{agent}`", three, agent) for agent in NAMES),
             ("`pretrained:best`", best, "sqn"),
@@ -126,41 +122,17 @@ def noise() -> str:
 
 def quick() -> str:
     """The run of `make train`, evaluated with more episodes."""
-    entries = _results("maze_quick_500.json")
+    entries = results_of("maze_quick_500.json")
     labels = {
         "random pairs": "random pairs of spawn points",
         "evaluation points": "the four evaluation points",
     }
     rows = []
     for tasks, label in labels.items():
-        entry = _one(entries, "sqn", "maze", tasks=tasks)
+        entry = one_of(entries, "sqn", "maze", tasks=tasks)
         spl = f"{entry['spl']['mean']:.2f} ± {spread(entry, 'spl'):.2f}"
-        rows.append([label, _mean_and_spread(entry), _steps(entry), spl])
+        rows.append([label, mean_and_spread(entry), steps(entry), spl])
     return markdown_table(["500 greedy episodes on the maze", "success", "steps", "SPL"], rows)
-
-
-def external() -> str:
-    """Policies and baselines on suites from elsewhere: success, worst tenth of the maps, SPL."""
-    return _suites("external.json")
-
-
-def fresh() -> str:
-    """The same on fresh procedural maps, one hard task each."""
-    return _suites("fresh.json")
-
-
-def _suites(name: str) -> str:
-    suites = recorded(name)["suites"]
-    names = [row["agent"] for row in next(iter(suites.values()))]
-    rows = [
-        [f"{suite} ({rows[0]['num_tasks']} tasks)", *(_with_worst(row) for row in rows)]
-        for suite, rows in suites.items()
-    ]
-    return markdown_table(["success, worst tenth, SPL", *names], rows)
-
-
-def _with_worst(row: Entry) -> str:
-    return f"{row['success']['mean']:.2f}, {worst_tenth(row):.2f}, {row['spl']['mean']:.2f}"
 
 
 def sensors() -> str:
@@ -225,26 +197,11 @@ def starts() -> str:
 TABLES = {
     each.__name__: each
     for each in (
-        *(agents, policies, quick, seeds, paper, paper_half, dead_ends, noise, external, fresh),
+        *(agents, policies, quick, seeds, paper, paper_half, dead_ends, noise),
+        *(external, fresh, best),
         *(sensors, simulator, breakdown, training, learner, starts),
     )
 }
-
-
-def spread(entry: Entry, metric: str = "success") -> float:
-    """Sample standard deviation of the means of the (training seed, evaluation seed) pairs.
-
-    Evaluation files without `std_ddof` hold the standard deviation of the population.
-    """
-    deviation: float = entry[metric]["std_of_means"]
-    count = len(entry["training_seeds"]) * len(entry["eval_seeds"])
-    return deviation if entry["std_ddof"] else deviation * float((count / (count - 1)) ** 0.5)
-
-
-def _results(name: str) -> list[Entry]:
-    """The results of an evaluation on record, each with the `std_ddof` of its file."""
-    evaluation = recorded(name)
-    return [{**entry, "std_ddof": evaluation.get("std_ddof", 0)} for entry in evaluation["results"]]
 
 
 def _over_seeds(evaluation: dict[str, Any]) -> str:
@@ -253,7 +210,7 @@ def _over_seeds(evaluation: dict[str, Any]) -> str:
     maps = list(dict.fromkeys(entry["map"] for entry in entries))
     rows = []
     for agent in dict.fromkeys(entry["agent"] for entry in entries):
-        scores = [_one(entries, agent, name)["success_per_seed"] for name in maps]
+        scores = [one_of(entries, agent, name)["success_per_seed"] for name in maps]
         count = f"{len(scores[0])} seed" + "s" * (len(scores[0]) > 1)
         rows.append([f"{NAMES[agent]}, {count}", *(_over(each) for each in scores)])
     return markdown_table(["", *maps], rows)
@@ -261,8 +218,8 @@ def _over_seeds(evaluation: dict[str, Any]) -> str:
 
 def _over(scores: Sequence[float]) -> str:
     deviation = sample_std(scores)
-    mean = f"{sum(scores) / len(scores):.2f}"
-    return mean if deviation is None else f"{mean} ± {deviation:.2f}"
+    text = f"{sum(scores) / len(scores):.2f}"
+    return text if deviation is None else f"{text} ± {deviation:.2f}"
 
 
 def _comparisons(evaluation: dict[str, Any]) -> str:
@@ -279,34 +236,9 @@ def _comparisons(evaluation: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _one(
-    entries: list[Entry],
-    agent: str,
-    name: str,
-    noise: tuple[float, float] = (0.0, 0.0),
-    tasks: str = "evaluation points",
-) -> Entry:
-    wanted = (agent, name, *noise, tasks, RADIUS)
-    labels = ("agent", "map", "velocity_noise", "range_noise", "tasks", "goal_radius")
-    (entry,) = (each for each in entries if tuple(each[label] for label in labels) == wanted)
-    return entry
-
-
-def _mean(entry: Entry) -> str:
-    return f"{entry['success']['mean']:.2f}"
-
-
-def _mean_and_spread(entry: Entry) -> str:
-    return f"{_mean(entry)} ± {spread(entry):.2f}"
-
-
-def _steps(entry: Entry) -> str:
-    return f"{entry['time_steps']['mean']:.0f}"
-
-
 def _in_full(entry: Entry) -> str:
     """Success, time steps, and in brackets the steps of the successes over the oracle's."""
-    text = f"{_mean_and_spread(entry)}, {_steps(entry)}"
+    text = f"{mean_and_spread(entry)}, {steps(entry)}"
     ratio = entry["steps_over_oracle"]
     return text if ratio is None or entry["agent"] == "oracle" else f"{text} ({ratio['mean']:.2f})"
 

@@ -39,6 +39,7 @@ JIT = (
     *("sqn_jax/policies/greedy.py", "sqn_jax/export/rollout.py", "sqn_jax/adapters/programs.py"),
     *("experiments/bench_simulator.py", "experiments/bench_learner.py"),
     *("experiments/bench_adapters.py", "examples/purejaxrl_ppo.py"),
+    "sqn_jax/env/loops.py",  # `traced_once` is inlined: it compiles nothing of its own.
     *("experiments/bench_breakdown.py", "experiments/check_gpu.py", "notebooks/01_first_steps.py"),
 )
 """Files that make compiled programs; jit elsewhere would nest and hide what compiles."""

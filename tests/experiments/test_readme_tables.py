@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from experiments import common, readme_tables
-from experiments.readme_tables import PAGES, ROOT, TABLES, filled, spread
+from experiments import common, readme_tables, suite_tables
+from experiments.entries import spread
+from experiments.readme_tables import PAGES, ROOT, TABLES, filled
 
 
 def entry(agent: str, name: str, scores: list[float], **changes: Any) -> dict[str, Any]:
@@ -106,3 +107,31 @@ def test_only_what_is_between_the_marks_is_replaced(monkeypatch: pytest.MonkeyPa
         filled("<!-- table nonsense -->\n<!-- end -->")
     with pytest.raises(ValueError, match="table seeds: 0 of them with an end"):
         filled("<!-- table seeds -->\n")
+
+
+def test_the_seeds_of_best_stand_beside_the_shipped_policy_and_the_baselines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def row(agent: str, success: float) -> dict[str, Any]:
+        mean = {"mean": success, "ci95": [success - 0.1, success]}
+        numbers = {"success": mean, "spl": {"mean": success / 4}}
+        return {"agent": agent, "num_tasks": 7, **numbers, "worst_tenth_split": success / 2}
+
+    seeds = [row(f"seed{number}", 0.2 * (number + 1)) for number in range(3)]
+    others = [row("pretrained:best", 0.1), row("bug", 1.0), row("oracle", 1.0)]
+    for name, suites in {
+        "best_suites.json": {"mrpb": seeds, "maze": seeds, "real": [*seeds, row("bug", 0.5)]},
+        "external.json": {"mrpb": others},
+        "fresh.json": {"maze": others},
+    }.items():
+        (tmp_path / name).write_text(json.dumps({"suites": suites}), encoding="utf-8")
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    cells = cells_of(suite_tables.best())
+    assert cells[0][1:] == ["seed0", "seed1", "seed2", "pretrained:best", "bug", "oracle"]
+    last = ["0.10, 0.05, 0.03", "1.00, 0.50, 0.25", "1.00, 0.50, 0.25"]
+    first = ["0.20, 0.10, 0.05", "0.40, 0.20, 0.10", "0.60, 0.30, 0.15"]
+    assert cells[2] == ["mrpb (7 tasks)", *first, *last]
+    assert cells[4] == ["real (7 tasks)", *first, "", "0.50, 0.25, 0.12", ""]
+    suites = cells_of(suite_tables.external())
+    assert suites[0][1:] == ["pretrained:best", "bug", "oracle"]
+    assert suites[2] == ["mrpb (7 tasks)", *last]
