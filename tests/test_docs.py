@@ -242,7 +242,7 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise Begun
 
     cli_tasks = importlib.import_module("sqn_jax.cli.tasks")
-    for name in ("_convert", "_generate", "_check"):
+    for name in ("_convert", "_generate", "_pairs", "_check"):
         monkeypatch.setattr(cli_tasks, name, begin)
     for module, name in (
         *((folder, "export_policy"), (check, "check_export")),
