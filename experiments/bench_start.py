@@ -24,6 +24,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = "SQN_BENCH_START_OUT"
@@ -133,9 +134,9 @@ def measured(command: list[str], out: Path) -> int:
     spans.add(started, time.monotonic(), "import")
     sys.argv = ["sqn", *command]
     code: Any = None
-    os._exit = sys.exit  # type: ignore[assignment]  # How a command ends: there is more to do here.
     try:
-        cli.run()
+        with mock.patch.object(os, "_exit", sys.exit):  # How a command ends; we have more to do.
+            cli.run()
     except SystemExit as stop:
         code = stop.code
     whole = time.monotonic() - started
@@ -219,8 +220,7 @@ def show(name: str, summed: dict[str, Any], num_programs: int) -> None:
 def main() -> None:
     """Measure a command, cold and warm."""
     if MEASURED in os.environ:
-        end_at_once = os._exit
-        end_at_once(measured(sys.argv[1:], Path(os.environ[MEASURED])))
+        os._exit(measured(sys.argv[1:], Path(os.environ[MEASURED])))
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -35,6 +35,7 @@ def one_of(
     noise: tuple[float, float] = (0.0, 0.0),
     tasks: str = "evaluation points",
 ) -> Entry:
+    """The result of an agent on a map, within `RADIUS`; there must be just one."""
     wanted = (agent, name, *noise, tasks, RADIUS)
     labels = ("agent", "map", "velocity_noise", "range_noise", "tasks", "goal_radius")
     (entry,) = (each for each in entries if tuple(each[label] for label in labels) == wanted)
@@ -42,12 +43,15 @@ def one_of(
 
 
 def mean(entry: Entry) -> str:
+    """Success."""
     return f"{entry['success']['mean']:.2f}"
 
 
 def mean_and_spread(entry: Entry) -> str:
+    """Success and its spread."""
     return f"{mean(entry)} ± {spread(entry):.2f}"
 
 
 def steps(entry: Entry) -> str:
+    """Mean time steps of an episode."""
     return f"{entry['time_steps']['mean']:.0f}"

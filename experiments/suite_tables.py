@@ -21,11 +21,12 @@ def fresh() -> str:
 
 
 def _suites(name: str) -> str:
+    suites = _by_agent(name)
     rows = [
         [_with_count(suite, found), *(_with_worst(row) for row in found.values())]
-        for suite, found in _by_agent(name).items()
+        for suite, found in suites.items()
     ]
-    agents = next(iter(_by_agent(name).values()))
+    agents = next(iter(suites.values()))
     return markdown_table(["success, worst tenth, SPL", *agents], rows)
 
 
