@@ -185,6 +185,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--max-speed", type=float, default=0.5, help="m/s, cap (default 0.5)")
     add("--max-turn-rate", type=float, default=1.0, help="rad/s, cap (default 1)")
     add("--goal-radius", type=float, default=0.3, help="m (default 0.3)")
+    add("--robot-radius", type=float, default=0.0, help="m (default 0: as trained)")
+    add("--bumper", type=float, default=0.05, help="m, as the node's (default 0.05; 0: none)")
     add(
         "--mount",
         nargs=3,
@@ -202,7 +204,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     try:
         limits = Limits(
-            options.max_speed, options.max_turn_rate, options.slowdown, options.goal_radius
+            max_speed=options.max_speed,
+            max_turn_rate=options.max_turn_rate,
+            slowdown=options.slowdown,
+            goal_radius=options.goal_radius,
+            robot_radius=options.robot_radius,
+            bumper=options.bumper,
         )
         controller = Controller(load_policy(options.policy), limits, obeyed=False)
         topics = {kind: getattr(options, kind) for kind in ("scan", "goal", "pose")}

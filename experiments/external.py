@@ -20,11 +20,12 @@ import numpy as np
 
 from experiments.common import run
 from sqn_jax.config import EnvConfig
-from sqn_jax.evaluation.agents import Agent, BaselineAgent, TrainedAgent
+from sqn_jax.evaluation.agents import Agent, BaselineAgent, TrainedAgent, with_epsilons
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.evaluation.suite_scores import worst_tenth
 from sqn_jax.policies.pretrained import find_policy, pretrained_names
+from sqn_jax.policies.run_policies import with_bumper
 from sqn_jax.runs.evaluate import evaluate_suite_session
 from sqn_jax.storage.files import write_json
 from sqn_jax.tasks import TaskSuite, read_suite
@@ -85,6 +86,7 @@ def main() -> None:
     parser.add_argument("--policies", nargs="+", help="default: those that come with the package")
     parser.add_argument("--eval-seeds", type=int, default=5)
     parser.add_argument("--oracle-tasks", type=int, default=50, help="of each suite (default 50)")
+    parser.add_argument("--bumper", type=float, help="of the policies' robot, m (default: none)")
     parser.add_argument("--no-baselines", action="store_true", help="the policies alone")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
@@ -92,7 +94,10 @@ def main() -> None:
     if not files:
         raise ValueError(f"{options.folder}: no suite, expected files ending in .json")
     names = options.policies or [f"pretrained:{name}" for name in pretrained_names()]
-    policies = [TrainedAgent(name, (find_policy(name),)) for name in names]
+    policies: Sequence[Agent] = with_epsilons(
+        [TrainedAgent(name, (with_bumper(find_policy(name), options.bumper),)) for name in names],
+        [0.0],
+    )
     robot = policies[0].env_config
     settings = SuiteSettings(eval_seeds=options.eval_seeds)
     suites: dict[str, Any] = {}

@@ -43,6 +43,7 @@ def episode_of(values: dict[str, Any]) -> Episode:
     values = dict(values)
     parts = np.array(values["reward_parts"], float)
     parts[:, 0] = np.where(values["reachable"], np.abs(parts[:, 0]) + 1e-3, 0.0)
+    parts = np.concatenate([parts, np.zeros((len(parts), 4 - parts.shape[1]))], axis=1)
     config = SimpleNamespace(
         max_range=values["max_range"],
         field_of_view_deg=math.degrees(values["field_of_view"]),
@@ -54,10 +55,10 @@ def episode_of(values: dict[str, Any]) -> Episode:
         goal_radius=values["goal_radius"],
         time_step=values["time_step"],
         lattice=values["lattice"],
-        reward_weights=np.ones(3),
+        reward_weights=np.array([1.0, 1.0, 1.0, 0.0]),
     )
-    names = ("reward_navigation", "reward_exploration", "reward_time")
-    info = dict(zip(names, parts.T, strict=True))
+    names = ("navigation", "exploration", "time", "collision")
+    info = {f"reward_{name}": part for name, part in zip(names, parts.T, strict=True)}
     info |= {"goal_distance": values["goal_distances"], "collision": values["collisions"]}
     output = (values[name] for name in ("q_values", "skill_weights", "skill_q_values"))
     trajectory = Trajectory(

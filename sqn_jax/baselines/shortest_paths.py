@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.env.geometry import wrap_angle
-from sqn_jax.maps.distance import MAX_SEARCHED_CELLS, clear_moves, goal_fields, is_searchable
+from sqn_jax.maps.distance import clear_moves, goal_fields, is_searchable, require_searchable
 from sqn_jax.maps.occupancy import OccupancyMap, points_to_cells, traversable
 
 MOVES = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if math.gcd(i, j) == 1]
@@ -56,11 +56,7 @@ def require_paths(occupancy_map: OccupancyMap, what: str) -> None:
     Raises:
         ValueError: one line naming the map.
     """
-    if not has_paths(occupancy_map):
-        raise ValueError(
-            f"map {occupancy_map.name}: {np.count_nonzero(~occupancy_map.occupied):,} free cells, "
-            f"expected at most {MAX_SEARCHED_CELLS:,} {what}"
-        )
+    require_searchable(~occupancy_map.occupied, occupancy_map.name, what)
 
 
 class ShortestPaths:

@@ -115,6 +115,18 @@ def add_epsilon(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_bumper(parser: argparse.ArgumentParser) -> None:
+    """Add the option --bumper."""
+    parser.add_argument(
+        "--bumper",
+        type=number,
+        default=None,
+        metavar="M",
+        help="m; a move that would bring the body so near to what the beams show is not made "
+        "(default: as trained, mostly none)",
+    )
+
+
 def pick(argument: str) -> int | Literal["worst"]:
     """A task of a suite by its number, or worst."""
     if argument == "worst":

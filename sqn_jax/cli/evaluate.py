@@ -10,6 +10,7 @@ from sqn_jax.cli.arguments import (
     CACHE,
     TASKS,
     Parser,
+    add_bumper,
     add_checkpoint,
     add_device,
     add_no_baselines,
@@ -66,8 +67,12 @@ def _agents(options: argparse.Namespace) -> list[Agent]:
     """The policies, once for each epsilon, and the baselines."""
     from sqn_jax.evaluation.agents import group_policies, with_baselines, with_epsilons
     from sqn_jax.policies.pretrained import find_policy
+    from sqn_jax.policies.run_policies import with_bumper
 
-    policies = [find_policy(name, options.checkpoint, options.params) for name in options.runs]
+    policies = [
+        with_bumper(find_policy(name, options.checkpoint, options.params), options.bumper)
+        for name in options.runs
+    ]
     trained = with_epsilons(group_policies(policies), options.epsilon)
     return with_baselines(trained, baselines=not options.no_baselines)
 
@@ -184,6 +189,7 @@ def _parser() -> Parser:
         metavar="E",
         help="probability of a random action, several give a row each (default 0: greedy)",
     )
+    add_bumper(parser)
     add_no_baselines(parser)
     add_checkpoint(parser)
     add_params(parser)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from sqn_jax.cli.arguments import (
     CACHE,
     TASKS,
     Parser,
+    add_bumper,
     add_checkpoint,
     add_device,
     add_epsilon,
@@ -50,6 +52,7 @@ def report(arguments: list[str]) -> int:
     add("--eval-seeds", type=integer, default=1, help="number of evaluation seeds (default 1)")
     add("--seed", type=integer, default=1_000, help="the first evaluation seed (default 1000)")
     add_epsilon(parser)
+    add_bumper(parser)
     add_no_baselines(parser)
     add_checkpoint(parser)
     add_params(parser)
@@ -65,11 +68,15 @@ def report(arguments: list[str]) -> int:
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
     from sqn_jax.evaluation.settings import Settings
+    from sqn_jax.policies.run_policies import with_bumper
     from sqn_jax.training import devices
 
     devices.require(options.device)
     reports.require_writable(options.out)
     runs = reports.read_runs(options.runs, options.checkpoint, options.params)
+    runs = [
+        dataclasses.replace(run, policy=with_bumper(run.policy, options.bumper)) for run in runs
+    ]
     config = runs[0].policy.config
     maps = options.maps or [str(config.maps.names[0])]
     settings = Settings(
@@ -89,6 +96,53 @@ def report(arguments: list[str]) -> int:
 
 def render(arguments: list[str]) -> int:
     """Write pictures and animations."""
+    options = _render_parser().parse_args(arguments)
+    if not options.runs:
+        raise ValueError("nothing to render: name a run folder or pretrained:NAME")
+    from sqn_jax.policies.pretrained import find_policy
+    from sqn_jax.policies.run_policies import with_bumper
+    from sqn_jax.training import devices
+
+    try:
+        from sqn_jax.report import render as renders
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("matplotlib"):
+            raise
+        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
+    devices.require(options.device)
+    for name in options.runs:
+        if options.runs.count(name) > 1:
+            raise ValueError(f"{name}: comes twice, expected each run once")
+    suite_name = _suite_to_draw(options)
+    policies = [
+        with_bumper(find_policy(name, options.checkpoint, options.params), options.bumper)
+        for name in options.runs
+    ]
+    map_name = options.map or "maze"
+    folder_of_pictures = options.out or renders.default_folder(policies, map_name, suite_name)
+    how: dict[str, Any] = {
+        "animations": options.animations,
+        "seed": options.seed,
+        "noise": (options.velocity_noise, options.range_noise),
+        "epsilon": options.epsilon,
+        "mp4": options.mp4,
+    }
+    if options.episodes is not None:
+        how["episodes"] = options.episodes
+    if suite_name is None:
+        how |= {"map_name": map_name, "tasks": TASKS[options.tasks]}
+        renders.render_session(policies, folder_of_pictures, max_steps=options.max_steps, **how)
+        return 0
+    from sqn_jax.report.render_suite import render_suite_session
+    from sqn_jax.tasks import read_suite
+
+    chosen: Any = "worst" if options.pick == ["worst"] else options.pick
+    suite = read_suite(suite_name)
+    render_suite_session(policies, suite, folder_of_pictures, source=suite_name, pick=chosen, **how)
+    return 0
+
+
+def _render_parser() -> Parser:
     parser = Parser(
         prog="sqn render",
         description="Run episodes of trained policies on a map and draw them: animations "
@@ -122,50 +176,12 @@ def render(arguments: list[str]) -> int:
     add("--max-steps", type=integer, default=0, help="steps per episode (default: the map's limit)")
     add("--mp4", action="store_true", help="also write MP4 files; needs sqn_jax[video]")
     add_epsilon(parser)
+    add_bumper(parser)
     add_checkpoint(parser)
     add_params(parser)
     add_device(parser)
     add("--out", type=folder, metavar="DIR", help="default: renders/RUN_MAP")
-    options = parser.parse_args(arguments)
-    if not options.runs:
-        raise ValueError("nothing to render: name a run folder or pretrained:NAME")
-    from sqn_jax.policies.pretrained import find_policy
-    from sqn_jax.training import devices
-
-    try:
-        from sqn_jax.report import render as renders
-    except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("matplotlib"):
-            raise
-        raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
-    devices.require(options.device)
-    for name in options.runs:
-        if options.runs.count(name) > 1:
-            raise ValueError(f"{name}: comes twice, expected each run once")
-    suite_name = _suite_to_draw(options)
-    policies = [find_policy(name, options.checkpoint, options.params) for name in options.runs]
-    map_name = options.map or "maze"
-    folder_of_pictures = options.out or renders.default_folder(policies, map_name, suite_name)
-    how: dict[str, Any] = {
-        "animations": options.animations,
-        "seed": options.seed,
-        "noise": (options.velocity_noise, options.range_noise),
-        "epsilon": options.epsilon,
-        "mp4": options.mp4,
-    }
-    if options.episodes is not None:
-        how["episodes"] = options.episodes
-    if suite_name is None:
-        how |= {"map_name": map_name, "tasks": TASKS[options.tasks]}
-        renders.render_session(policies, folder_of_pictures, max_steps=options.max_steps, **how)
-        return 0
-    from sqn_jax.report.render_suite import render_suite_session
-    from sqn_jax.tasks import read_suite
-
-    chosen: Any = "worst" if options.pick == ["worst"] else options.pick
-    suite = read_suite(suite_name)
-    render_suite_session(policies, suite, folder_of_pictures, source=suite_name, pick=chosen, **how)
-    return 0
+    return parser
 
 
 def _suite_to_draw(options: argparse.Namespace) -> Path | None:

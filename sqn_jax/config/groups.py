@@ -35,6 +35,11 @@ class EnvConfig:
     """Seconds a step."""
     robot_radius: float = 0.1
     """Radius of the robot's body, m; 0 is a point."""
+    bumper: float = 0.0
+    """How near, m from its body, a robot lets come what its beams show: it does not make the move,
+    and is told that it was refused. 0: moves are refused where the body touches something."""
+    scan_margin: float = 0.0
+    """How much thicker obstacles are in the scan that the agent sees, m; see `env.scan_margin`."""
     goal_radius: float = 0.3
     """The goal counts as reached within this distance, m."""
     max_goal_distance: float = 24.0
@@ -70,15 +75,19 @@ class EnvConfig:
     """Weight of newly covered area, 1/m2 (paper eq. 7 and 9)."""
     reward_time: float = 0.2
     """Weight of the constant penalty of -1 a step (paper eq. 9)."""
+    reward_collision: float = 0.0
+    """Weight of a penalty of -1 for each refused move; the paper has none."""
 
     def __post_init__(self) -> None:
         distances = ("max_range", "goal_radius", "max_goal_distance", "goal_distance_scale")
         for name in (*distances, "time_step", "coverage_cell"):
             require_positive(self, "env", name)
         speeds_and_size = ("forward_speed", "backward_speed", "turn_rate", "robot_radius")
-        for name in (*speeds_and_size, "velocity_noise", "range_noise"):
+        margins = ("bumper", "scan_margin", "velocity_noise", "range_noise")
+        for name in (*speeds_and_size, *margins):
             require_not_negative(self, "env", name)
-        for name in ("reward_navigation", "reward_exploration", "reward_time"):
+        terms = ("navigation", "exploration", "time", "collision")
+        for name in (f"reward_{term}" for term in terms):
             value = getattr(self, name)
             require(math.isfinite(value), f"env.{name}", value, "a finite number")
         require_known_choices(self, "env")

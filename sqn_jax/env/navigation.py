@@ -4,7 +4,8 @@ A robot with range beams and the goal's distance and heading moves through an oc
 
 Observation: `Observation(ranges [71], goal [2])`, every number in 0..1.
 Action: 0 stand still, 1 forward 2.5 m/s, 2 backward 1.25 m/s, 3 turn left pi rad/s, 4 turn right.
-Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 7 to 9).
+Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 7 to 9);
+`env.reward_collision`, 0 by default, is the penalty of a refused move.
 End: never terminated; truncated after `max_steps` steps. Reaching the goal does not end an
 episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
 
@@ -29,10 +30,12 @@ from sqn_jax.env.arguments import (
     require_place,
     require_state,
 )
+from sqn_jax.env.bumper import is_blocked
 from sqn_jax.env.dynamics import move
 from sqn_jax.env.geometry import beam_angles, encode_distance, goal_in_robot_frame
 from sqn_jax.env.params import EnvParams, EnvState, Observation
 from sqn_jax.env.raycast import cast_fan
+from sqn_jax.env.scan_margin import thickened
 
 NUM_ACTIONS = 5
 STAND, FORWARD, BACKWARD, LEFT, RIGHT = range(5)
@@ -115,9 +118,10 @@ def step(
 
     Returns:
         Observation, state, reward, terminated (always False), truncated, and info: `reached`
-        (goal within `goal_radius`), `collision` (a refused move), `goal_distance` m,
+        (goal within `goal_radius`), `collision` (a move refused since the body touches something),
+        `refused` (the same, or a move that the bumper has stopped), `goal_distance` m,
         `covered_area` m2 newly seen, and the unweighted reward terms `reward_navigation`,
-        `reward_exploration`, `reward_time`.
+        `reward_exploration`, `reward_time`, `reward_collision`.
 
     Raises:
         ValueError: the action is known and none of 0..4, or an argument is of another kind or
@@ -131,9 +135,10 @@ def step(
     velocity = params.commands[action]
     if params.config.velocity_noise > 0:
         velocity = velocity + params.velocity_noise * jax.random.normal(motion_key, (2,))
+    blocked = _bumper_stops(state.pose, velocity, params)
     pose, collision = move(
         state.pose,
-        velocity,
+        jnp.where(blocked, 0.0, velocity),
         params.body,
         time_step=params.time_step,
         iterations=MOTION_ITERATIONS,
@@ -149,15 +154,18 @@ def step(
     navigation = reward.navigation_reward(distance, reachable)
     exploration = reward.exploration_reward(fresh_area)
     time = reward.time_reward()
-    total = reward.total_reward(navigation, exploration, time, params.reward_weights)
+    refused = reward.collision_reward(collision)
+    total = reward.total_reward(navigation, exploration, time, refused, params.reward_weights)
     info = {
         "reached": distance < params.goal_radius,
         "collision": collision,
+        "refused": collision | blocked,
         "goal_distance": distance,
         "covered_area": fresh_area,
         "reward_navigation": navigation,
         "reward_exploration": exploration,
         "reward_time": jnp.float32(time),
+        "reward_collision": refused,
     }
     terminated = jnp.bool_(False)
     truncated = new_state.step >= params.max_steps
@@ -166,7 +174,10 @@ def step(
 
 
 def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Observation:
-    """Turn true readings [R] m and the goal into what the agent sees, with noise if configured."""
+    """Turn true readings [R] m and the goal into what the agent sees.
+
+    With noise and a `scan_margin` if configured.
+    """
     config = params.config
     if config.range_noise > 0:
         noise = params.range_noise * jax.random.uniform(key, ranges.shape, minval=-1.0)
@@ -174,6 +185,13 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
             ranges = ranges * (1 + noise)
         else:
             ranges = ranges + config.max_range * noise
+    if config.scan_margin > 0:
+        ranges = thickened(
+            ranges,
+            beam_angles(config).astype(np.float32),
+            margin=config.scan_margin,
+            max_range=config.max_range,
+        )
     distance, heading = goal_in_robot_frame(state.pose, state.goal)
     if params.mirrored is not None:
         ranges = jnp.where(params.mirrored, ranges[::-1], ranges)
@@ -212,6 +230,19 @@ def covered_along(poses: Array, params: EnvParams) -> Array:
 
     _, covered = jax.lax.scan(look, coverage.empty(params.lattice), poses)
     return covered
+
+
+def _bumper_stops(pose: Array, velocity: Array, params: EnvParams) -> Array:
+    """Whether the bumper, if there is one, keeps the robot from this move."""
+    config = params.config
+    if config.bumper == 0:
+        return jnp.bool_(False)
+    return is_blocked(
+        true_ranges(pose, params),
+        beam_angles(config).astype(np.float32),
+        velocity[0] * params.time_step,
+        reach=config.robot_radius + config.bumper,
+    )
 
 
 def _add_scan(covered: Array, pose: Array, ranges: Array, params: EnvParams) -> tuple[Array, Array]:

@@ -49,7 +49,7 @@ class EnvParams:
     """Half-width of the uniform noise on the readings; see `EnvConfig.range_noise_unit`. Without
     effect unless `config.range_noise` is more than 0, which compiles the noise in."""
     reward_weights: Array
-    """[3] weights of navigation, exploration and time."""
+    """[4] weights of navigation, exploration, time and collision."""
     mirrored: Array | None
     """bool: what the robot sees is the mirror image of where it is, left for right. With turn rates
     of the other sign in `commands`, it lives in the mirror image of the map. None compiles nothing

@@ -103,15 +103,19 @@ def make_env(
         goal_radius=jnp.float32(config.goal_radius),
         velocity_noise=_velocity_noise(config),
         range_noise=jnp.float32(config.range_noise),
-        reward_weights=jnp.array(
-            [config.reward_navigation, config.reward_exploration, config.reward_time], jnp.float32
-        ),
+        reward_weights=jnp.asarray(reward_weights_of(config)),
         mirrored=None,
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
         lattice=Lattice.over(height_m, width_m, config.coverage_cell, config.max_range),
         tile=None if occupancy_map.tiles == (1, 1) else (width_m, height_m),
     )
+
+
+def reward_weights_of(config: EnvConfig) -> NDArray[np.float32]:
+    """[4] weights of navigation, exploration, time and collision."""
+    of_paper = [config.reward_navigation, config.reward_exploration, config.reward_time]
+    return np.array([*of_paper, config.reward_collision], np.float32)
 
 
 def commands_of(config: EnvConfig) -> NDArray[np.float32]:

@@ -1,4 +1,7 @@
-"""The reward of the paper (section III-C, eq. 7 to 9): navigation, exploration and time."""
+"""The reward of the paper (section III-C, eq. 7 to 9): navigation, exploration and time.
+
+Beside it there is a term for refused moves, which the paper lacks; its weight is 0 by default.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +48,14 @@ def time_reward() -> float:
     return -1.0
 
 
-def total_reward(navigation: Array, exploration: Array, time: float, weights: Array) -> Array:
-    """Weighted sum of the three terms (eq. 9); `weights` [3] in the order of the arguments."""
-    return weights[0] * navigation + weights[1] * exploration + weights[2] * time
+def collision_reward(refused: Array) -> Array:
+    """The penalty of a refused move: -1, else 0."""
+    return jnp.where(refused, -1.0, 0.0)
+
+
+def total_reward(
+    navigation: Array, exploration: Array, time: float, collision: Array, weights: Array
+) -> Array:
+    """Weighted sum of the terms (eq. 9); `weights` [4] in the order of the arguments."""
+    of_paper = weights[0] * navigation + weights[1] * exploration + weights[2] * time
+    return of_paper + weights[3] * collision

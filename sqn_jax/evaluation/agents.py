@@ -281,7 +281,9 @@ def group_policies(policies: Sequence[Policy]) -> list[TrainedAgent]:
 
 
 def with_epsilons(agents: Sequence[TrainedAgent], epsilons: Sequence[float]) -> list[TrainedAgent]:
-    """Each agent once for each probability of a random action; named by it, if it is more than 0.
+    """Each agent once for each probability of a random action.
+
+    The names say it, if it is more than 0, and the same for the bumper.
 
     Raises:
         ValueError: a probability is not in 0..1, or comes twice.
@@ -292,7 +294,8 @@ def with_epsilons(agents: Sequence[TrainedAgent], epsilons: Sequence[float]) -> 
             raise ValueError(f"epsilon: {epsilon} comes twice, expected each once")
 
     def named(agent: TrainedAgent, epsilon: float) -> TrainedAgent:
-        name = f"{agent.name}, epsilon {epsilon:g}" if epsilon > 0 else agent.name
+        said = {"epsilon": epsilon, "bumper": agent.env_config.bumper}
+        name = ", ".join([agent.name, *(f"{key} {said[key]:g}" for key in said if said[key] > 0)])
         return dataclasses.replace(agent, name=name, epsilon=epsilon)
 
     return [named(agent, epsilon) for agent in agents for epsilon in epsilons]

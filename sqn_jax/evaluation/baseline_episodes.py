@@ -308,7 +308,7 @@ def run_baseline(
     """
     # Observations of many episodes take much memory and are rarely needed.
     needed = ("actions", *(("obs",) if "obs" in fields else ()))
-    trajectory = navigator(keys, env_params, needed)
+    trajectory = navigator(keys, _own_robot(env_params), needed)
     if "output" in fields:
         trajectory = dataclasses.replace(trajectory, output=_one_skill(trajectory))
     radii = goal_radii or [float(env_params.goal_radius)]
@@ -338,10 +338,19 @@ def run_on_tasks(
         tasks: [E] of them.
         collision_ends: whether a refused move makes a task fail.
     """
-    trajectory = navigator(keys, env_params, (), tasks)
+    trajectory = navigator(keys, _own_robot(env_params), (), tasks)
     metrics = task_metrics(trajectory, tasks, collision_ends=collision_ends)
     starts, goals = jax.device_get((trajectory.poses[0], trajectory.goals))
     return EpisodeResults([metrics], starts, goals, Trajectory())
+
+
+def _own_robot(env_params: EnvParams) -> EnvParams:
+    """A world in which baselines, which know how wide they are, see obstacles as they are.
+
+    Nor has their robot a bumper.
+    """
+    config = dataclasses.replace(env_params.config, scan_margin=0.0, bumper=0.0)
+    return dataclasses.replace(env_params, config=config)
 
 
 def _one_skill(steps: Trajectory) -> QOutput:

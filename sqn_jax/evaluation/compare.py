@@ -301,6 +301,7 @@ def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
             if config.robot_radius == agent.env_config.robot_radius
             else {"robot_radius": config.robot_radius}
         ),
+        **({"bumper": agent.env_config.bumper} if agent.env_config.bumper > 0 else {}),
     }
 
 

@@ -93,9 +93,12 @@ class Episode:
 
     @cached_property
     def reward_parts(self) -> Floats:
-        """[T, 3] the weighted terms navigation, exploration and time; their sum is the reward."""
-        names = ("reward_navigation", "reward_exploration", "reward_time")
-        parts = np.stack([self.trajectory.info[name] for name in names], axis=-1)
+        """[T, 4] the weighted terms navigation, exploration, time and collision.
+
+        Their sum is the reward.
+        """
+        names = ("navigation", "exploration", "time", "collision")
+        parts = np.stack([self.trajectory.info[f"reward_{name}"] for name in names], axis=-1)
         return parts * np.asarray(self.env_params.reward_weights)
 
     @property

@@ -117,14 +117,22 @@ class World:
     noise: tuple[float, float]
 
 
+def with_body(robot: EnvConfig, trained: EnvConfig) -> EnvConfig:
+    """A robot as an agent sees it that was trained with another one.
+
+    Where its body is wider, the agent sees obstacles thicker by the difference (`env.scan_margin`).
+    """
+    wider = max(0.0, robot.robot_radius - trained.robot_radius)
+    return dataclasses.replace(robot, scan_margin=robot.scan_margin + wider)
+
+
 def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     """The robot of an agent under the settings of an evaluation, yet without noise."""
+    radius = settings.robot_radius
+    robot = env_config if radius is None else dataclasses.replace(env_config, robot_radius=radius)
     return dataclasses.replace(
-        env_config,
+        with_body(robot, env_config),
         max_steps=settings.max_steps,
-        robot_radius=env_config.robot_radius
-        if settings.robot_radius is None
-        else settings.robot_radius,
         near_goal_fraction=0.0,
         velocity_noise=0.0,
         velocity_noise_unit=settings.noise_unit or env_config.velocity_noise_unit,

@@ -28,7 +28,7 @@ from sqn_jax.env.several_maps import join_maps
 from sqn_jax.evaluation import baseline_episodes, episodes, suite_scores
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, OnBatch, TrainedAgent
 from sqn_jax.evaluation.episodes import EpisodeResults, GivenTasks
-from sqn_jax.evaluation.settings import SuiteSettings
+from sqn_jax.evaluation.settings import SuiteSettings, with_body
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.tasks.suite import Task, TaskSuite
 from sqn_jax.training import memory_budget
@@ -131,9 +131,8 @@ def evaluate_suite(
 
 def robot_for(env_config: EnvConfig, suite: TaskSuite) -> EnvConfig:
     """The robot of an agent with what a suite fixes, yet without noise."""
-    return dataclasses.replace(
-        suite.robot_of(env_config), near_goal_fraction=0.0, velocity_noise=0.0, range_noise=0.0
-    )
+    robot = with_body(suite.robot_of(env_config), env_config)
+    return dataclasses.replace(robot, near_goal_fraction=0.0, velocity_noise=0.0, range_noise=0.0)
 
 
 def chunks(

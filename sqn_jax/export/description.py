@@ -31,7 +31,7 @@ KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
             *("robot_radius", "goal_radius", "max_steps", "coverage_cell", "ray_sectors"),
             *("ray_iterations", "velocity_noise", "velocity_noise_unit", "range_noise"),
             *("range_noise_unit", "near_goal_fraction", "reward_navigation"),
-            *("reward_exploration", "reward_time"),
+            *("reward_exploration", "reward_time", "reward_collision"),
         }
     ),
 }

@@ -89,7 +89,7 @@ def _roll(
         carry, output = step_policy(params, obs, carry, refused, network)
         new_obs, state, *_, info = step(key, state, output.q_values.argmax(), world)
         seen = obs, refused, carry, output.q_values, output.skill_weights
-        return (new_obs, state, info["collision"], carry), seen
+        return (new_obs, state, info["refused"], carry), seen
 
     rollout: tuple[Observation, Array, Array, Array, Array] = jax.lax.scan(advance, start, keys)[1]
     return rollout

@@ -31,6 +31,24 @@ Floats = NDArray[np.floating]
 
 MAX_STEPS_SHOWN = 8
 
+REWARD_TERMS = (
+    ("navigation", COLORS[2], "-"),
+    ("exploration", COLORS[5], "--"),
+    ("time", "#777777", "-."),
+    ("collision", COLORS[1], ":"),
+)
+"""Name, color and line style of each column of `Episode.reward_parts`."""
+
+
+def reward_sums(episode: Episode) -> Floats:
+    """Cumulative sums [T + 1, K] of the first K `REWARD_TERMS`, from 0 on.
+
+    All four, or three where a collision costs nothing.
+    """
+    shown = 4 if episode.env_params.reward_weights[3] != 0 else 3
+    parts = episode.reward_parts[:, :shown]
+    return np.cumsum(np.concatenate([np.zeros((1, shown)), parts]), axis=0)
+
 
 # ---------------------------------------------------------------------------------------- coverage
 

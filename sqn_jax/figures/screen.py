@@ -18,6 +18,7 @@ from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from sqn_jax.evaluation.recording import Episode
+from sqn_jax.figures.episode import REWARD_TERMS, reward_sums
 from sqn_jax.figures.ground import (
     FREE,
     ONE_SKILL,
@@ -46,8 +47,6 @@ ROBOT = COLORS[5]
 ROBOT_PX = 19
 SCAN = COLORS[4]
 REACHED = "#00704f"
-REWARD_LINES = (("navigation", COLORS[2], "-"), ("exploration", COLORS[5], "--"))
-TIME_LINE = ("time", "#777777", "-.")
 
 KEY_COLORS = (
     *("#ffffff", FREE, SEEN, OBSTACLE, INK, ROBOT, SCAN, YELLOW, RED, REACHED, ONE_SKILL),
@@ -303,8 +302,7 @@ class Screen:
     def _make_rewards(self) -> None:
         episode = self.episode
         last = last_step(episode)
-        sums = np.cumsum(episode.reward_parts[:last], axis=0, dtype=np.float64)
-        self._sums = np.concatenate([np.zeros((1, 3)), sums])
+        self._sums = reward_sums(episode)[: last + 1]
         self._times = np.arange(last + 1) * episode.time_step
         axes = self._axes(REWARD_BOX)
         tidy(axes)
@@ -315,7 +313,7 @@ class Screen:
         axes.tick_params(labelsize=8, length=2, pad=2)
         axes.locator_params(nbins=5)
         lines = []
-        for name, color, style in (*REWARD_LINES, TIME_LINE):
+        for name, color, style in REWARD_TERMS[: self._sums.shape[1]]:
             line = axes.plot([], [], color=color, ls=style, lw=1.8, label=name)[0]
             lines.append(self._add(axes, line))
         self._reward_lines = lines

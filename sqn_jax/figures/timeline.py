@@ -10,11 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sqn_jax.evaluation.recording import Episode
+from sqn_jax.figures.episode import REWARD_TERMS, reward_sums
 from sqn_jax.figures.ground import mark_arrival, skill_color
 from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
-
-_REWARD_PARTS = ("navigation", "exploration", "time")
-_PART_STYLES = ((COLORS[2], "-"), (COLORS[5], "--"), ("#7a7a7a", "-."))
 
 
 def episode_timeline(episode: Episode, *, title: str) -> Figure:
@@ -88,8 +86,8 @@ def _draw_values(axes: Axes, episode: Episode) -> None:
 def _draw_rewards(axes: Axes, episode: Episode) -> None:
     """Cumulative sums of the weighted terms of the reward, and of the reward."""
     times = np.arange(episode.num_steps + 1) * episode.time_step
-    sums = np.cumsum(np.concatenate([np.zeros((1, 3)), episode.reward_parts]), axis=0)
-    for values, name, (color, style) in zip(sums.T, _REWARD_PARTS, _PART_STYLES, strict=True):
+    sums = reward_sums(episode)
+    for values, (name, color, style) in zip(sums.T, REWARD_TERMS, strict=False):
         axes.plot(times, values, color=color, ls=style, lw=1.8, label=name)
     axes.plot(times, sums.sum(axis=1), color=INK, lw=1.2, label="reward")
     axes.set_ylabel("reward\nup to here")

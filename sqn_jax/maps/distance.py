@@ -34,6 +34,24 @@ def is_searchable(free: NDArray[np.bool_]) -> bool:
     return int(np.count_nonzero(free)) <= MAX_SEARCHED_CELLS
 
 
+def require_searchable(free: NDArray[np.bool_], map_name: str, what: str) -> None:
+    """Refuse a map [H, W] that is too large for paths to be searched on it.
+
+    Args:
+        free: its free cells.
+        map_name: for the error.
+        what: paths are wanted for, in the error.
+
+    Raises:
+        ValueError: one line naming the map.
+    """
+    if not is_searchable(free):
+        raise ValueError(
+            f"map {map_name}: {np.count_nonzero(free):,} free cells, expected at most "
+            f"{MAX_SEARCHED_CELLS:,} {what}"
+        )
+
+
 def clearance_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Distance, in cells, from each cell center to the nearest occupied cell's closed square.
 

@@ -50,7 +50,7 @@ class GreedyPolicy:
         Args:
             obs: what `sqn_jax.reset` and `sqn_jax.step` return, of one robot.
             carry: from `start` or the step before.
-            refused: whether the last move failed, `info["collision"]` of `sqn_jax.step`; False at
+            refused: whether the last move failed, `info["refused"]` of `sqn_jax.step`; False at
                 first. A policy with `network.motion_inputs` needs it, others ignore it.
 
         Returns:
@@ -72,7 +72,7 @@ class GreedyPolicy:
         if refused is None and self.config.network.motion_inputs:
             raise ValueError(
                 f"policy {self.name} has network.motion_inputs, expected refused=False at first "
-                "and then info['collision'] of the step before"
+                "and then info['refused'] of the step before"
             )
         return cast(
             tuple[Array, QOutput],

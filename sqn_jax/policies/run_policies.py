@@ -14,6 +14,7 @@ import numpy as np
 from sqn_jax import config as configs
 from sqn_jax.agent.networks import Params
 from sqn_jax.config import TrainConfig
+from sqn_jax.config.validation import LIMITS, require_limits
 from sqn_jax.storage.manifest import Origin, leaves_of
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder
 from sqn_jax.training.devices import put
@@ -123,6 +124,19 @@ def of_seed(policy: Policy, seed: int | None) -> Policy:
     chosen = seeds[0] if seed is None else seed
     config = dataclasses.replace(policy.config, seed=chosen, num_seeds=1)
     return Policy(policy.name, config, (policy.params[seeds.index(chosen)],))
+
+
+def with_bumper(policy: Policy, bumper: float | None) -> Policy:
+    """The policy on a robot with a virtual bumper (`env.bumper`), in m; None: as it was trained.
+
+    Raises:
+        ValueError: the number is out of range.
+    """
+    if bumper is None:
+        return policy
+    require_limits(bumper, "bumper", *LIMITS["env.bumper"])
+    env = dataclasses.replace(policy.config.env, bumper=bumper)
+    return dataclasses.replace(policy, config=dataclasses.replace(policy.config, env=env))
 
 
 def network_settings(config: TrainConfig) -> dict[str, Any]:

@@ -5,7 +5,6 @@ Maps are named by kind and seed ("maze:1000000"), which is all that a file needs
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -27,7 +26,7 @@ from sqn_jax.maps.occupancy import (
     points_to_cells,
     traversable,
 )
-from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_TASKS, Task
+from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_TASKS, Task, steps_along
 
 FIRST_SEED = 1000
 """Maps of smaller seeds are those that policies are trained on and that pictures show."""
@@ -108,8 +107,8 @@ def hardest_task(name: ProceduralMap) -> Task:
     episode is as long as the map's, or four times the steps of the shortest path if that is more.
     """
     occupancy_map = load_map(name)
-    robot = EnvConfig()
-    free = traversable(occupancy_map.occupied, occupancy_map.resolution, robot.robot_radius)
+    radius = EnvConfig.robot_radius
+    free = traversable(occupancy_map.occupied, occupancy_map.resolution, radius)
     numbers = np.random.PCG64([_STREAM, KINDS.index(name.kind), name.seed])
     places = _draw_places(occupancy_map, free, np.random.Generator(numbers))
     goals, starts = places[:_NUM_GOALS], places[_NUM_GOALS:]
@@ -122,14 +121,13 @@ def hardest_task(name: ProceduralMap) -> Task:
     straight = np.linalg.norm(goals[:, None] - starts[None], axis=-1)
     goal, start = hardest_pair(paths, straight)
     shortest_path = float(paths[goal, start])
-    steps = math.ceil(_LIMIT_FACTOR * shortest_path / (robot.forward_speed * robot.time_step))
     (x, y), (goal_x, goal_y) = occupancy_map.to_map_frame([starts[start], goals[goal]]).round(6)
     return Task(
         map_file=str(name),
         start=(float(x), float(y)),
         heading=None,
         goal=(float(goal_x), float(goal_y)),
-        max_steps=max(occupancy_map.max_steps, steps),
+        max_steps=max(occupancy_map.max_steps, steps_along(_LIMIT_FACTOR * shortest_path)),
         goal_radius=DEFAULT_GOAL_RADIUS,
         shortest_path=round(shortest_path, 4),
     )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.config.groups import EnvConfig
-from sqn_jax.maps.distance import MAX_SEARCHED_CELLS, goal_fields, is_searchable
+from sqn_jax.maps.distance import goal_fields, require_searchable
 from sqn_jax.maps.occupancy import (
     OccupancyMap,
     cells_to_points,
@@ -15,7 +15,7 @@ from sqn_jax.maps.occupancy import (
     traversable,
 )
 from sqn_jax.tasks.convert import ConvertedMap
-from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_STEPS, MAX_TASKS, Task
+from sqn_jax.tasks.suite import DEFAULT_GOAL_RADIUS, MAX_STEPS, MAX_TASKS, Task, steps_along
 
 DEFAULT_COUNT = 50
 DEFAULT_LIMIT = 4.0
@@ -54,11 +54,10 @@ def random_tasks(
     if not 1.0 <= limit <= MAX_STEPS:
         raise ValueError(f"limit: {limit:g}, expected 1 to {MAX_STEPS:,}")
     pairs, lengths = _draw_pairs(occupancy_map, count, seed, robot_radius)
-    step = EnvConfig.forward_speed * EnvConfig.time_step
-    max_steps = np.ceil(limit * lengths / step).astype(int)
-    if max_steps.max() > MAX_STEPS:
+    longest = steps_along(limit * float(lengths.max()))
+    if longest > MAX_STEPS:
         raise ValueError(
-            f"limit: {limit:g} times a path of {lengths.max():.0f} m is {max_steps.max():,} steps, "
+            f"limit: {limit:g} times a path of {lengths.max():.0f} m is {longest:,} steps, "
             f"expected at most {MAX_STEPS:,}"
         )
     tasks = [
@@ -67,12 +66,12 @@ def random_tasks(
             start=(start[0], start[1]),
             heading=None,
             goal=(goal[0], goal[1]),
-            max_steps=int(steps),
+            max_steps=steps_along(limit * length),
             goal_radius=DEFAULT_GOAL_RADIUS,
-            shortest_path=round(float(length), 4),
+            shortest_path=round(length, 4),
         )
-        for (start, goal), length, steps in zip(
-            occupancy_map.to_map_frame(pairs).round(6).tolist(), lengths, max_steps, strict=True
+        for (start, goal), length in zip(
+            occupancy_map.to_map_frame(pairs).round(6).tolist(), lengths.tolist(), strict=True
         )
     ]
     sources = [f"map {occupancy_map.name}, task {number}" for number in range(count)]
@@ -85,11 +84,7 @@ def _draw_pairs(
     """Starts and goals [count, 2, 2] in the grid frame, m, and lengths of their paths [count]."""
     resolution = occupancy_map.resolution
     free = traversable(occupancy_map.occupied, resolution, robot_radius)
-    if not is_searchable(free):
-        raise ValueError(
-            f"map {occupancy_map.name}: {np.count_nonzero(free):,} free cells, expected at most "
-            f"{MAX_SEARCHED_CELLS:,} to search paths on"
-        )
+    require_searchable(free, occupancy_map.name, "to search paths on")
     labels, _ = connected_components(free)
     row, column = points_to_cells(occupancy_map.spawn_points[0], resolution)
     cells = np.argwhere(free & (labels == labels[row, column]))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import math
 import reprlib
 import typing
 from collections.abc import Collection, Iterable
@@ -49,6 +50,11 @@ ROBOT_FIELDS = tuple(
     if hint in (int, float) and name not in _OF_A_TASK
 )
 """Settings of `EnvConfig` that a suite can fix: numbers, but those that each task has itself."""
+
+
+def steps_along(path_length: float) -> int:
+    """Steps that a path of so many m takes at the full speed of our robot, without a turn."""
+    return math.ceil(path_length / (EnvConfig.forward_speed * EnvConfig.time_step))
 
 
 @dataclass(frozen=True)

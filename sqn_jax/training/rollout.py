@@ -162,7 +162,7 @@ def step_actors(
         poses=actors.env_state.pose,
         info=info,
     )
-    obs = next_observation(actors.obs, obs, actions, info["collision"])
+    obs = next_observation(actors.obs, obs, actions, info["refused"])
     return dataclasses.replace(actors, obs=obs, env_state=env_state), taken
 
 

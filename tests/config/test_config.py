@@ -17,7 +17,7 @@ from sqn_jax.config import EnvConfig, LearnerConfig, ReplayConfig, TrainConfig
 from sqn_jax.config.presets import PRESETS
 
 # Weights of the reward may be negative.
-SIGNED = {"env.reward_navigation", "env.reward_exploration", "env.reward_time"}
+SIGNED = {f"env.reward_{term}" for term in ("navigation", "exploration", "time", "collision")}
 # Below these whole numbers, and below 0 elsewhere, nothing is accepted.
 AT_LEAST_ONE = {
     *("env.ray_iterations", "network.hidden_size", "network.num_skills"),
@@ -362,6 +362,7 @@ def test_the_paper_preset_holds_the_values_of_the_paper() -> None:
     assert env.velocity_noise == env.range_noise == env.near_goal_fraction == 0.0
     # The reward (eq. 9).
     assert (env.reward_navigation, env.reward_exploration, env.reward_time) == (2.0, 1.0, 0.2)
+    assert env.reward_collision == 0.0
     # One update a finished episode, sequences of the map's own length, R2D2 with all its parts.
     assert paper.updates_per_round == paper.num_envs
     assert env.max_steps == 0

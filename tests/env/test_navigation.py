@@ -24,11 +24,13 @@ take = jax.jit(step)
 INFO = {
     "reached",
     "collision",
+    "refused",
     "goal_distance",
     "covered_area",
     "reward_navigation",
     "reward_exploration",
     "reward_time",
+    "reward_collision",
 }
 
 
@@ -227,7 +229,7 @@ def test_the_step_compiles_once_for_all_actions_states_and_maps_of_one_shape(
     other = hall_params.replace(
         commands=2 * hall_params.commands,
         goal_radius=jnp.float32(0.5),
-        reward_weights=jnp.array([1.0, 2.0, 3.0]),
+        reward_weights=jnp.array([1.0, 2.0, 3.0, 4.0]),
     )
     counted(key, state, jnp.int32(1), other)
     assert traces == 1

@@ -14,6 +14,7 @@ from rollouts import Rollout
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams, make_env, reset_to, step
 from sqn_jax.env.reward import (
+    collision_reward,
     exploration_reward,
     goal_is_reachable,
     navigation_reward,
@@ -171,10 +172,34 @@ def test_the_terms_are_the_equations() -> None:
     assert navigation_reward(jnp.float32(0.5), jnp.bool_(False)) == 0.0
     assert exploration_reward(jnp.float32(1.25)) == 1.25
     assert time_reward() == -1.0
-    # 2.0 x 0.5 + 1.0 x 1.25 + 0.2 x (-1) = 2.05; with unlike weights 0.5 + 12.5 - 100 = -87.
-    for weights, expected in (((2.0, 1.0, 0.2), 2.05), ((1.0, 10.0, 100.0), -87.0)):
-        total = total_reward(jnp.float32(0.5), jnp.float32(1.25), -1.0, jnp.array(weights))
-        assert total == pytest.approx(expected, abs=1e-5)
+    assert collision_reward(jnp.bool_(True)) == -1.0
+    assert collision_reward(jnp.bool_(False)) == 0.0
+    # 2.0 x 0.5 + 1.0 x 1.25 + 0.2 x (-1) = 2.05; with unlike weights 0.5 + 12.5 - 100 = -87, and
+    # minus 1000 for the collision.
+    terms = jnp.float32(0.5), jnp.float32(1.25), -1.0, jnp.float32(-1.0)
+    for weights, expected in (
+        ((2.0, 1.0, 0.2, 0.0), 2.05),
+        ((1.0, 10.0, 100.0, 0.0), -87.0),
+        ((1.0, 10.0, 100.0, 1000.0), -1087.0),
+    ):
+        total = total_reward(*terms, jnp.array(weights))
+        assert total == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_refused_move_costs_its_weight(walled: BOOLS, walled_params: EnvParams) -> None:
+    config = dataclasses.replace(walled_params.config, reward_collision=0.75)
+    dear = make_env(wrap_map(walled, [(1.0, 1.0), (13.0, 1.0)]), config)
+    corner, goal = jnp.array([0.5, 0.5, np.pi]), jnp.array([13.0, 1.0])
+    _, state = start_at(KEY, corner, goal, dear)
+    refused = 0
+    for number in range(20):
+        _, state, reward, _, _, info = take(KEY, state, FORWARD, dear)
+        expected = 2.0 * info["reward_navigation"] + info["covered_area"] - 0.2
+        if info["collision"]:
+            refused, expected = refused + 1, expected - 0.75
+        assert reward == pytest.approx(float(expected), abs=1e-5), number
+        assert info["reward_collision"] == (-1.0 if info["collision"] else 0.0)
+    assert 0 < refused < 20  # It drives to the wall, and pushes against it.
 
 
 def test_the_weights_come_from_the_config(walled: BOOLS, walled_params: EnvParams) -> None:

@@ -25,7 +25,7 @@ from sqn_jax.evaluation.agents import (
     with_baselines,
 )
 from sqn_jax.evaluation.compare import _distinct_names, load_maps, num_episodes
-from sqn_jax.evaluation.settings import Settings
+from sqn_jax.evaluation.settings import Settings, robot_for, worlds
 from sqn_jax.maps import (
     OccupancyMap,
     goal_distance,
@@ -221,6 +221,26 @@ def test_files_of_one_name_are_told_apart_by_their_folders() -> None:
 def test_the_robot_of_an_evaluation_may_have_another_radius() -> None:
     settings = Settings(maps=("maze",), episodes=1, robot_radius=0.3)
     assert set(load_maps([BaselineAgent("bug", EnvConfig())], settings)) == {("maze", 0.3)}
+
+
+def test_a_wider_body_sees_obstacles_thicker_by_the_difference() -> None:
+    trained = EnvConfig(robot_radius=0.1)
+    for radius, margin in ((0.33, 0.23), (0.1, 0.0), (0.05, 0.0), (None, 0.0)):
+        robot = robot_for(trained, Settings(maps=("maze",), robot_radius=radius))
+        assert robot.robot_radius == (radius or 0.1)
+        assert robot.scan_margin == pytest.approx(margin)
+
+
+def test_the_wall_follower_sees_obstacles_as_they_are() -> None:
+    # It keeps away from what it sees by its own width.
+    settings = Settings(maps=("maze",), episodes=2, eval_seeds=1, max_steps=60)
+    runs = []
+    for margin in (0.0, 0.3):
+        robot = dataclasses.replace(robot_for(EnvConfig(), settings), scan_margin=margin)
+        (world,) = worlds(robot, {("maze", 0.1): load_map("maze")}, settings)
+        ((results,),) = BaselineAgent("bug", robot).run([5], world, settings, ("obs",), id)
+        runs.append(results.trajectory.obs.ranges)
+    np.testing.assert_array_equal(*runs)
 
 
 def test_a_damaged_file_is_named_in_one_line_and_nothing_is_driven(

@@ -84,6 +84,13 @@ def chunk() -> suites.SuiteChunk:
     return chunk
 
 
+def test_what_a_suite_says_of_the_body_becomes_what_a_policy_sees() -> None:
+    wide = dataclasses.replace(SUITE, robot=(("robot_radius", 0.33),))
+    robot = suites.robot_for(EnvConfig(robot_radius=0.1), wide)
+    assert (robot.robot_radius, robot.scan_margin) == (0.33, pytest.approx(0.23))
+    assert suites.robot_for(EnvConfig(), SUITE).scan_margin == 0.0
+
+
 def run(chunk: suites.SuiteChunk, policies: TrainedAgent, chosen: Any = slice(None)) -> Any:
     keys = suites._keys(jnp.asarray(chunk.numbers), SETTINGS)[chosen]
     tasks = jax.tree.map(lambda x: x[chosen], chunk.repeated(SETTINGS.tries))

@@ -100,7 +100,7 @@ class MadeUpPolicy:
 
     beam_angles = np.radians(np.linspace(-175, 175, 71))
     time_step = 0.1
-    env = {"max_range": 5.0}  # noqa: RUF012
+    env = {"max_range": 5.0, "robot_radius": 0.1}  # noqa: RUF012
     seen: list[tuple[float, float]] = []  # noqa: RUF012
 
     def act(self, ranges: Any, distance: float, heading: float, hidden: Any) -> Any:

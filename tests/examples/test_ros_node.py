@@ -27,7 +27,7 @@ class MadeUpPolicy:
 
     beam_angles = BEAMS
     time_step = 0.1
-    env = {"max_range": 5.0}  # noqa: RUF012
+    env = {"max_range": 5.0, "robot_radius": 0.1}  # noqa: RUF012
 
     def __init__(self) -> None:
         self.seen: list[tuple[Any, float, float, Any]] = []
@@ -209,8 +209,50 @@ def test_a_move_is_refused_by_what_was_commanded_and_in_a_recording_never() -> N
         assert [seen[4] for seen in policy.seen] == [False, expected]  # type: ignore[misc]
 
 
+def test_the_bumper_stops_a_move_and_says_so_to_the_policy() -> None:
+    class Slim(MotionPolicy):
+        """It drives forward whatever it sees."""
+
+        def act(self, *args: Any, refused: bool) -> Any:  # type: ignore[override]
+            return (2.5, 0.0), super().act(*args, refused=refused)[1]
+
+    for obeyed in (True, False):
+        policy = Slim()
+        controller = Controller(policy, Limits(bumper=0.05), obeyed=obeyed)
+        controller.set_goal((0.0, 30.0))
+        commands = []
+        for time, ahead in ((0.0, 0.41), (0.5, 0.39), (1.0, 0.41)):
+            # 0.25 m on, with a body of 0.1 m, 0.06 m are left to what is ahead, or 0.04 m.
+            controller.set_scan(scan(ahead), Mount(), time)
+            commands.append(controller.tick(lambda time=time: (time, 0.0, 0.0), time))
+        assert commands == [Command(0.5), Command(), Command(0.5)]
+        assert [seen[4] for seen in policy.seen] == [False, False, True]  # type: ignore[misc]
+        controller.set_goal((9.0, 0.0))
+        controller.tick(here, 1.1)
+        assert policy.seen[-1][4] is False  # type: ignore[misc]
+
+
+def test_a_wide_robot_shows_its_policy_thicker_obstacles_and_stops_sooner() -> None:
+    controller, policy = driving(robot_radius=0.4, bumper=0.05)
+    assert controller.tick(here, 0.0) == Command(0.5, 0.0)
+    ranges = policy.seen[0][0]
+    assert ranges[35] == pytest.approx(2.7)  # 3 m ahead, 0.3 m wider than in the training.
+    controller.set_scan(scan(ahead=1.29), Mount(), 0.5)
+    assert controller.tick(here, 0.5).speed == 0.0  # It sees 0.99 m, and turns.
+    controller, policy = driving(robot_radius=1.0, bumper=0.05)
+    controller.set_scan(scan(ahead=1.29), Mount(), 0.0)
+    policy.act = lambda *_: ((2.5, 0.0), 0)  # type: ignore[method-assign]
+    assert controller.tick(here, 0.0) == Command()
+    controller, _ = driving(bumper=0.0)
+    controller.set_scan(scan(ahead=1.01), Mount(), 0.0)
+    assert controller.tick(here, 0.0) == Command(0.5, 0.0)
+
+
 def test_limits_are_checked() -> None:
-    for name, value in (("slowdown", 0.0), ("max_speed", math.inf), ("unseen", math.nan)):
+    for name, value in (
+        *(("slowdown", 0.0), ("max_speed", math.inf), ("unseen", math.nan)),
+        *(("robot_radius", -0.1), ("bumper", math.nan)),
+    ):
         with pytest.raises(ValueError, match=f"{name} is"):
             Limits(**{name: value})
 

@@ -464,7 +464,7 @@ def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> Non
             **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "embeddings": False},
             "r2d2_width_factor": 3,
         },
-        EnvConfig: {},
+        EnvConfig: {"bumper": 0.05, "scan_margin": 0.2},
     }
     require_exportable(TrainConfig())
     for group, known in KNOWN_SETTINGS.items():

@@ -76,7 +76,7 @@ def episode(
         carry, output = step_network(policy.params[0], seen, carry, network)
         action = rng.integers(5) if at_random else np.asarray(output.q_values).argmax()
         obs, state, reward, _, _, info = _step(KEY, state, np.int32(action), world)
-        seen = next_observation(seen, obs, action, info["collision"])
+        seen = next_observation(seen, obs, action, info["refused"])
         terms = [info[f"reward_{name}"] for name in ("navigation", "exploration", "time")]
         taken = {
             "poses": state.pose,

@@ -13,9 +13,15 @@ import { castRay } from './raycast.js';
  * @property {Float32Array} goal distance and heading, as the settings encode them
  * @property {Float32Array} motion the last action, one-hot, and 1 if it was a move that was refused
  *
+ * @typedef {object} Reward the terms with their weights, and their sum
+ * @property {number} navigation
+ * @property {number} exploration
+ * @property {number} time
+ * @property {number} collision
+ * @property {number} total
+ *
  * @typedef {object} Step
- * @property {{navigation: number, exploration: number, time: number, total: number}} reward the terms
- *   with their weights, and their sum
+ * @property {Reward} reward
  * @property {boolean} reached whether the goal is nearer than its radius
  * @property {boolean} collision whether a move was refused
  * @property {number} freshArea newly seen, m2
@@ -117,8 +123,12 @@ export class Env {
     const navigation = settings.reward_navigation * (reachable ? Math.exp(-distance) : 0);
     const exploration = settings.reward_exploration * freshArea;
     const time = -settings.reward_time;
+    const refused = collision ? -settings.reward_collision : 0;
     return {
-      reward: { navigation, exploration, time, total: navigation + exploration + time },
+      reward: {
+        ...{ navigation, exploration, time, collision: refused },
+        total: navigation + exploration + time + refused,
+      },
       reached: distance < single(settings.goal_radius),
       collision,
       freshArea,

@@ -13,7 +13,7 @@ import { shortestPath } from './paths.js';
  * @typedef {object} Moment one step, for the strips over time
  * @property {Float32Array} weights skill weights
  * @property {Float32Array} hidden recurrent state
- * @property {{navigation: number, exploration: number, time: number, total: number}} reward
+ * @property {import('./env.js').Reward} reward
  */
 
 const FEWEST_FREE_CELLS = 50;

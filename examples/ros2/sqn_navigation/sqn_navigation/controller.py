@@ -18,8 +18,10 @@ from sqn_navigation.conversions import (
     Mount,
     Scan,
     goal_in_robot_frame,
+    is_blocked,
     limited,
     scan_to_sectors,
+    thickened,
 )
 
 Pose = tuple[float, float, float]
@@ -44,6 +46,11 @@ class Limits:
     """m, reading of directions that the sensor does not cover."""
     time_limit: float = 600.0
     """s, a goal that is not reached by then is given up."""
+    robot_radius: float = 0.0
+    """m, of a circle around the body; where it is wider than that of the training, the policy sees
+    obstacles thicker by the difference. 0: as wide as in the training."""
+    bumper: float = 0.05
+    """m from the body; a move that would bring what the scan shows nearer is not made. 0: none."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -59,6 +66,10 @@ class Limits:
                 raise ValueError(f"{name} is {value}, expected a positive number")
         if not self.unseen >= 0:
             raise ValueError(f"unseen is {self.unseen}, expected 0 or more m")
+        for name in ("robot_radius", "bumper"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} is {value}, expected 0 or more m")
 
 
 @dataclass(frozen=True)
@@ -122,6 +133,10 @@ class Controller:
         self._began = math.inf
         self._command = Command()
         self._decided_at: Pose | None = None
+        self._stopped = False
+        trained = float(policy.env["robot_radius"])
+        self._radius = limits.robot_radius or trained
+        self._margin = max(0.0, self._radius - trained)
 
     @property
     def has_goal(self) -> bool:
@@ -132,7 +147,7 @@ class Controller:
         """A new goal [x, y] m, or none: the policy forgets what it saw on the way to the last."""
         self._goal, self._hidden = goal, None
         self._decided, self._began, self._command = -math.inf, math.inf, Command()
-        self._decided_at = None
+        self._decided_at, self._stopped = None, False
 
     def set_scan(self, scan: Scan, mount: Mount, time: float) -> None:
         """A scan, measured at `time` s."""
@@ -191,21 +206,28 @@ class Controller:
         )
 
     def _is_refused(self, here: Pose) -> bool:
-        """Whether the last command was a move, of which the robot made less than a tenth.
+        """Whether the last move was stopped, or the robot made less than a tenth of it.
 
         A command must hold for longer than poses are late, else each move seems to be refused.
         """
-        if self._decided_at is None or not self.obeyed:
+        if self._decided_at is None:
             return False
+        if self._stopped or not self.obeyed:
+            return self._stopped
         commanded = abs(self._command.speed) * self.policy.time_step * self.limits.slowdown
         return math.dist(here[:2], self._decided_at[:2]) < commanded / 10
 
     def _decide(self, distance: float, heading: float, refused: bool) -> Command:
+        angles, ranges = self.policy.beam_angles, self._ranges
+        if self._margin > 0:
+            ranges = thickened(ranges, angles, self._margin, self.policy.env["max_range"])
         # Only a policy that was trained with motion inputs looks at its last move.
         more = {"refused": refused} if getattr(self.policy, "motion_size", 0) else {}
-        velocity, self._hidden = self.policy.act(
-            self._ranges, distance, heading, self._hidden, **more
-        )
+        velocity, self._hidden = self.policy.act(ranges, distance, heading, self._hidden, **more)
+        travel, reach = float(velocity[0]) * self.policy.time_step, self.limits.bumper
+        self._stopped = reach > 0 and is_blocked(self._ranges, angles, travel, self._radius + reach)
+        if self._stopped:
+            return Command()
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))

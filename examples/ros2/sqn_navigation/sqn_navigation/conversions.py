@@ -104,6 +104,47 @@ def wrap_angle(angle: Floats) -> Floats:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def thickened(ranges: Floats, beam_angles: Floats, margin: float, max_range: float) -> Floats:
+    """Ranges as if everything that was hit were thicker by a margin.
+
+    So a wide robot shows a policy what the slim one of its training would see. `sqn_jax.env` has
+    the same in `scan_margin.py`.
+
+    Args:
+        ranges: [R] m, `max_range` where nothing is hit.
+        beam_angles: [R] rad.
+        margin: m, by which the body is wider.
+        max_range: m.
+
+    Returns:
+        [R] m, 0 where a hit in that direction is nearer than the margin.
+    """
+    turns = beam_angles[:, None] - beam_angles[None]
+    ahead, aside = ranges * np.cos(turns), ranges * np.sin(turns)
+    meets = (np.abs(aside) < margin) & (ahead > 0) & (ranges < max_range)
+    entries = ahead - np.sqrt(np.maximum(margin**2 - aside**2, 0.0))
+    nearest = np.where(meets, np.maximum(entries, 0.0), max_range).min(axis=1)
+    return np.minimum(nearest, ranges)
+
+
+def is_blocked(ranges: Floats, beam_angles: Floats, travel: float, reach: float) -> bool:
+    """Whether a straight move would bring the robot's center within reach of what was hit.
+
+    As `bumper.py` of `sqn_jax.env`: a robot that is nearer already may make the moves that do not
+    bring it nearer still.
+
+    Args:
+        ranges: [R] m.
+        beam_angles: [R] rad.
+        travel: m, negative for a move backward.
+        reach: m, from the center.
+    """
+    ahead, aside = ranges * np.cos(beam_angles), ranges * np.sin(beam_angles)
+    beyond = ahead - np.clip(ahead, min(travel, 0.0), max(travel, 0.0))
+    nearest = np.hypot(beyond, aside).min()
+    return bool(nearest < reach and nearest < ranges.min() - 1e-3)
+
+
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
     """Heading of a quaternion, rad."""
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -38,6 +38,8 @@ PARAMETERS: dict[str, Any] = {
     "stale_after": 0.3,
     "unseen": math.inf,
     "time_limit": 600.0,
+    "robot_radius": 0.0,
+    "bumper": 0.05,
 }
 """See config/sqn_navigation.yaml."""
 
