@@ -17,10 +17,16 @@ from typing import Any
 from experiments import play_page
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
+from sqn_jax.config.map_names import ProceduralMap
 from sqn_jax.config.presets import PAPER_MAPS, PRESETS
+from sqn_jax.evaluation.agents import TrainedAgent
 from sqn_jax.evaluation.recording import Episode, record
+from sqn_jax.evaluation.settings import SuiteSettings
+from sqn_jax.evaluation.suite_recording import first_try, record_tasks
 from sqn_jax.maps import load_map
 from sqn_jax.policies.pretrained import find_policy
+from sqn_jax.tasks import TaskSuite
+from sqn_jax.tasks.generate import hardest_task
 from sqn_jax.training.state import params_shapes
 
 FIGURE_AGENTS = ("SQN", "R2D2", "DQN", "best")
@@ -36,6 +42,11 @@ def episodes(name: str, map_name: str, count: int) -> tuple[Episode, ...]:
     recorded_episodes = record(policy, map_name, episodes=count)
     agent = policy.config.algo.upper()
     return tuple(dataclasses.replace(episode, agent=agent) for episode in recorded_episodes)
+
+
+def first_to_arrive(name: str, map_name: str, count: int) -> Episode:
+    """The first of these episodes that reaches its goal."""
+    return next(one for one in episodes(name, map_name, count) if one.success)
 
 
 def network() -> Any:
@@ -65,7 +76,7 @@ def reachability() -> Any:
 
 def timeline() -> Any:
     """Skills, values and rewards along an episode."""
-    return figures.episode_timeline(episodes("best", "cave", 6)[0], title="SQN in the cave")
+    return figures.episode_timeline(first_to_arrive("best", "cave", 6), title="SQN in the cave")
 
 
 def skills() -> Any:
@@ -74,6 +85,28 @@ def skills() -> Any:
     return figures.skill_trajectories(
         recorded_episodes, title="Weights of the two skills along the way"
     )
+
+
+def failures() -> Any:
+    """The tasks of its validation in which `pretrained:best` fails: the same episodes."""
+    maps_tried = recorded("best_recipe_validation.json")["results"][0]["maps"]
+    failed = [index for index, tried in enumerate(maps_tried) if tried["success"] == 0]
+    tasks = {index: hardest_task(ProceduralMap(*_kind(maps_tried[index]))) for index in failed}
+    # An episode follows from the number of its task; the others only stand in their places.
+    every = tuple(tasks.get(index, tasks[failed[0]]) for index in range(len(maps_tried)))
+    agent = TrainedAgent("SQN", (find_policy("pretrained:best"),))
+    settings = first_try(SuiteSettings.seed)
+    recorded_episodes = record_tasks(
+        agent, TaskSuite("failures", every), failed, load_map, settings
+    )
+    return figures.skill_trajectories(
+        recorded_episodes, title="The five of 108 validation tasks that fail"
+    )
+
+
+def _kind(tried: dict[str, Any]) -> tuple[str, int]:
+    kind, seed = tried["map"].split(":")
+    return kind, int(seed)
 
 
 def agents() -> Any:
@@ -132,6 +165,7 @@ STILLS: dict[str, Callable[[], Any]] = {
             reachability,
             timeline,
             skills,
+            failures,
             agents,
             trajectories,
         ),
@@ -139,7 +173,7 @@ STILLS: dict[str, Callable[[], Any]] = {
     )
 }
 FILMS = {"maze": ("sqn", 8), "cave": ("best", 6)}
-"""Maps that a film is made of, who drives, and how many episodes; the first is shown."""
+"""Maps that a film is made of, who drives, and how many episodes; the first to arrive is shown."""
 
 
 def main() -> None:
@@ -154,7 +188,7 @@ def main() -> None:
             print(f"wrote {options.out / name}.png", flush=True)
     for name, (policy, count) in FILMS.items():
         if not options.only or name in options.only:
-            film = figures.gif(episodes(policy, name, count)[0], count=160, width_px=720)
+            film = figures.gif(first_to_arrive(policy, name, count), count=160, width_px=720)
             (options.out / f"{name}.gif").write_bytes(film)
             print(f"wrote {options.out / name}.gif", flush=True)
     if not options.only or "play" in options.only:

@@ -20,14 +20,14 @@ from experiments import bench_breakdown, bench_learner, bench_simulator, bench_t
 from experiments.common import recorded, run
 from experiments.entries import Entry, mean, mean_and_spread, one_of, results_of, spread, steps
 from experiments.robustness import LEVELS, RANGE_NOISE, VELOCITY_NOISE
-from experiments.suite_tables import best, external, fresh
+from experiments.suite_tables import best, card, external, fresh
 from sqn_jax.config.presets import PAPER_MAPS
 from sqn_jax.evaluation.paper_results import PAPER_RESULTS
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.statistics import sample_std
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCS = ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT")
+DOCS = ("RESULTS", "LAB_NOTES", "PERFORMANCE", "DEPLOYMENT", "MODEL_CARD")
 PAGES = ("README.md", *(f"docs/{name}.md" for name in DOCS))
 NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
@@ -198,7 +198,7 @@ TABLES = {
     each.__name__: each
     for each in (
         *(agents, policies, quick, seeds, paper, paper_half, dead_ends, noise),
-        *(external, fresh, best),
+        *(external, fresh, best, card),
         *(sensors, simulator, breakdown, training, learner, starts),
     )
 }

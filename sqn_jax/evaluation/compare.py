@@ -22,7 +22,14 @@ from sqn_jax.evaluation import scores
 from sqn_jax.evaluation.agents import Agent, BaselineAgent, EpisodeBatch, OnBatch, TrainedAgent
 from sqn_jax.evaluation.cached_paths import path_lengths
 from sqn_jax.evaluation.episodes import EpisodeResults
-from sqn_jax.evaluation.settings import Maps, Settings, World, robot_for, worlds
+from sqn_jax.evaluation.settings import (
+    Maps,
+    Settings,
+    World,
+    as_the_oracle_knows_it,
+    robot_for,
+    worlds,
+)
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.training import memory_budget
 
@@ -166,6 +173,7 @@ def evaluate_agents(
     main_radius = settings.goal_radii[0]
     # Whole trajectories come to the host only where somebody looks at them.
     needed = () if on_evaluated is None else tuple(dict.fromkeys(("poses", "goals", *fields)))
+    oracles: dict[Any, list[EpisodeBatch]] = {}
     for robot in dict.fromkeys(robots.values()):
         paths: dict[bytes, NDArray[np.float64] | None] = {}
         for world in worlds(robot, maps, settings):
@@ -183,11 +191,17 @@ def evaluate_agents(
                     # The steps of many episodes would fill the memory; statistics need none.
                     without_steps = dataclasses.replace(batch, trajectory=batch.trajectory.only())
                     evaluated[agent.name].append(without_steps)
+            same_tasks = (
+                *(as_the_oracle_knows_it(robot), world.occupancy_map.name),
+                *(world.tasks, world.noise),
+            )
+            if "oracle" in evaluated:
+                oracles[same_tasks] = evaluated["oracle"]
             for agent in actors:
                 for radius in settings.goal_radii:
                     labels = _labels(agent, world, radius)
                     batches = evaluated[agent.name]
-                    described = scores.describe(batches, radius, evaluated.get("oracle"))
+                    described = scores.describe(batches, radius, oracles.get(same_tasks))
                     results.append({**labels, **_seeds(agent, settings), **described})
                     records += scores.records(batches, radius, **labels)
                 if world.noise == (0.0, 0.0):

@@ -126,6 +126,18 @@ def with_body(robot: EnvConfig, trained: EnvConfig) -> EnvConfig:
     return dataclasses.replace(robot, scan_margin=robot.scan_margin + wider)
 
 
+_SEEN = (
+    *("goal_distance_encoding", "goal_distance_scale", "max_goal_distance", "heading_encoding"),
+    *("scan_margin", "bumper", "ray_sectors", "ray_iterations"),
+)
+
+
+def as_the_oracle_knows_it(robot: EnvConfig) -> EnvConfig:
+    """A robot without what only agents see of it: two that are equal so have the same oracle."""
+    usual = EnvConfig()
+    return dataclasses.replace(robot, **{name: getattr(usual, name) for name in _SEEN})
+
+
 def robot_for(env_config: EnvConfig, settings: Settings) -> EnvConfig:
     """The robot of an agent under the settings of an evaluation, yet without noise."""
     radius = settings.robot_radius

@@ -24,7 +24,12 @@ from sqn_jax.evaluation.agents import (
     group_policies,
     with_baselines,
 )
-from sqn_jax.evaluation.compare import _distinct_names, load_maps, num_episodes
+from sqn_jax.evaluation.compare import (
+    _distinct_names,
+    evaluate_agents,
+    load_maps,
+    num_episodes,
+)
 from sqn_jax.evaluation.settings import Settings, robot_for, worlds
 from sqn_jax.maps import (
     OccupancyMap,
@@ -229,6 +234,21 @@ def test_a_wider_body_sees_obstacles_thicker_by_the_difference() -> None:
         robot = robot_for(trained, Settings(maps=("maze",), robot_radius=radius))
         assert robot.robot_radius == (radius or 0.1)
         assert robot.scan_margin == pytest.approx(margin)
+
+
+def test_the_oracle_is_that_of_all_robots_that_differ_in_what_they_see(tmp_path: Path) -> None:
+    path = write_empty_room(tmp_path)
+    settings = Settings(maps=(str(path),), episodes=3, eval_seeds=1)
+    far, slow = EnvConfig(goal_distance_encoding="rational"), EnvConfig(forward_speed=1.0)
+    agents = [BaselineAgent("oracle", EnvConfig()), BaselineAgent("bug", far)]
+    evaluation, _ = evaluate_agents(agents, load_maps(agents, settings), settings)
+    ratios = {one["agent"]: one["steps_over_oracle"] for one in evaluation["results"]}
+    assert ratios["bug"]["mean"] > 1.0
+    # Another robot takes other ways.
+    agents = [agents[0], BaselineAgent("bug", slow)]
+    evaluation, _ = evaluate_agents(agents, load_maps(agents, settings), settings)
+    assert evaluation["results"][-1]["agent"] == "bug"
+    assert evaluation["results"][-1]["steps_over_oracle"] is None
 
 
 def test_the_wall_follower_sees_obstacles_as_they_are() -> None:

@@ -109,15 +109,16 @@ def test_only_what_is_between_the_marks_is_replaced(monkeypatch: pytest.MonkeyPa
         filled("<!-- table seeds -->\n")
 
 
-def test_the_seeds_of_best_stand_beside_the_shipped_policy_and_the_baselines(
+def test_the_seeds_of_best_stand_beside_what_was_there_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def row(agent: str, success: float) -> dict[str, Any]:
-        numbers = {"success": {"mean": success}, "spl": {"mean": success / 4}}
+        mean = {"mean": success, "ci95": [success - 0.1, success]}
+        numbers = {"success": mean, "spl": {"mean": success / 4}}
         return {"agent": agent, "num_tasks": 7, **numbers, "worst_tenth_split": success / 2}
 
     seeds = [row(f"seed{number}", 0.2 * (number + 1)) for number in range(3)]
-    others = [row("pretrained:best", 0.1), row("bug", 1.0), row("oracle", 1.0)]
+    others = [row("chain", 0.1), row("bug", 1.0), row("oracle", 1.0)]
     for name, suites in {
         "best_suites.json": {"mrpb": seeds, "maze": seeds, "real": [*seeds, row("bug", 0.5)]},
         "external.json": {"mrpb": others},
@@ -125,12 +126,23 @@ def test_the_seeds_of_best_stand_beside_the_shipped_policy_and_the_baselines(
     }.items():
         (tmp_path / name).write_text(json.dumps({"suites": suites}), encoding="utf-8")
     monkeypatch.setattr(common, "RESULTS", tmp_path)
+    monkeypatch.setattr(suite_tables, "card_of", lambda name: {"training_seed": 1})
     cells = cells_of(suite_tables.best())
-    assert cells[0][1:] == ["seed0", "seed1", "seed2", "pretrained:best", "bug", "oracle"]
+    assert cells[0][1:] == ["seed 0", "seed 1", "seed 2", "the chain before", "bug", "oracle"]
     last = ["0.10, 0.05, 0.03", "1.00, 0.50, 0.25", "1.00, 0.50, 0.25"]
     first = ["0.20, 0.10, 0.05", "0.40, 0.20, 0.10", "0.60, 0.30, 0.15"]
     assert cells[2] == ["mrpb (7 tasks)", *first, *last]
     assert cells[4] == ["real (7 tasks)", *first, "", "0.50, 0.25, 0.12", ""]
+    maps = [
+        {**entry(agent, name, [0.957]), "success": {"mean": 0.957, "ci95": [0.9, 1.0]}}
+        for agent in ("sqn best", "bug")
+        for name in ("maze", "column", "forest", "cave")
+    ]
+    write(tmp_path, "pretrained_table.json", maps, [])
+    card = cells_of(suite_tables.card())
+    assert card[2] == ["mrpb (7 tasks)", "0.40", "0.30 to 0.40", "0.10", "1.00"]
+    assert card[4][4] == "0.50"
+    assert card[5] == ["maze", "0.96", "0.90 to 1.00", "0.50", "0.96"]
     suites = cells_of(suite_tables.external())
     assert suites[0][1:] == ["pretrained:best", "bug", "oracle"]
-    assert suites[2] == ["mrpb (7 tasks)", *last]
+    assert suites[2] == ["mrpb (7 tasks)", first[1], *last[1:]]
