@@ -30,7 +30,7 @@ from sqn_jax.figures import style
 from sqn_jax.maps import known_maps
 from sqn_jax.play import page as play_page
 from sqn_jax.policies import pretrained
-from sqn_jax.policies.run_policies import Policy, require_same_network
+from sqn_jax.policies.run_policies import Policy, require_same_network, with_bumper
 from sqn_jax.report import render
 from sqn_jax.runs import evaluate, train
 from sqn_jax.storage.run_folder import RunFolder
@@ -235,8 +235,9 @@ def _only_read(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def prepare(options: Any, settings: Any) -> None:
         raise Begun
 
-    def read_runs(names: list[str], *which: Any) -> list[Any]:
-        return [type("Run", (), {"policy": find_policy(name, *which)}) for name in names]
+    def read_runs(names: list[str], checkpoint: Any, params: Any, bumper: Any) -> list[Any]:
+        read = [with_bumper(find_policy(name, checkpoint, params), bumper) for name in names]
+        return [type("Run", (), {"policy": policy}) for policy in read]
 
     def begin(*_: Any, **options: Any) -> None:
         raise Begun

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +67,11 @@ def report(arguments: list[str]) -> int:
             raise
         raise ValueError("Matplotlib is not installed (pip install 'sqn_jax[viz]')") from None
     from sqn_jax.evaluation.settings import Settings
-    from sqn_jax.policies.run_policies import with_bumper
     from sqn_jax.training import devices
 
     devices.require(options.device)
     reports.require_writable(options.out)
-    runs = reports.read_runs(options.runs, options.checkpoint, options.params)
-    runs = [
-        dataclasses.replace(run, policy=with_bumper(run.policy, options.bumper)) for run in runs
-    ]
+    runs = reports.read_runs(options.runs, options.checkpoint, options.params, options.bumper)
     config = runs[0].policy.config
     maps = options.maps or [str(config.maps.names[0])]
     settings = Settings(

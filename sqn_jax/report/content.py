@@ -23,7 +23,7 @@ from sqn_jax.evaluation.compare import evaluate_agents, load_maps, memory_bytes,
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.outside.messages import say
 from sqn_jax.policies.pretrained import find_policy, names_a_run
-from sqn_jax.policies.run_policies import Policy, WhichParams
+from sqn_jax.policies.run_policies import Policy, WhichParams, with_bumper
 from sqn_jax.report.episodes import WorstEpisode, worst_episodes
 from sqn_jax.runs.progress import episodes_bar
 from sqn_jax.storage.run_folder import RunFolder
@@ -61,7 +61,10 @@ class Content:
 
 
 def read_runs(
-    names: Sequence[str], checkpoint: int | str = "newest", params: WhichParams = "shipped"
+    names: Sequence[str],
+    checkpoint: int | str = "newest",
+    params: WhichParams = "shipped",
+    bumper: float | None = None,
 ) -> list[Run]:
     """Read runs by the names that a user gives: folders, `pretrained:NAME`, or files NAME.npz.
 
@@ -71,11 +74,13 @@ def read_runs(
         names: the names.
         checkpoint: of each run, see `run_policies.load_policy`.
         params: of each run, see `run_policies.load_policy`.
+        bumper: of its robot, see `run_policies.with_bumper`.
 
     Raises:
-        ValueError: a run is missing or damaged.
+        ValueError: a run is missing or damaged, or the bumper is out of range.
     """
-    runs = [_read_run(name, checkpoint, params) for name in names]
+    read = [_read_run(name, checkpoint, params) for name in names]
+    runs = [replace(run, policy=with_bumper(run.policy, bumper)) for run in read]
     counts = Counter(run.name for run in runs)
     return [
         replace(run, name=name, policy=replace(run.policy, name=name))

@@ -43,7 +43,7 @@ def test_episodes_are_those_of_the_program(tmp_path: Path) -> None:
     policies = [load_pretrained(name) for name in ("best", "r2d2", "dqn")]
     # One that looks at its last action, which is drawn for it and often refused.
     network = NetworkConfig(hidden_size=16, motion_inputs=True, cell="refined_gru")
-    looking_on = dataclasses.replace(policies[0].config, algo="sqn", network=network)
+    looking_on = dataclasses.replace(policies[1].config, algo="sqn", network=network)
     policies.append(random_policy(looking_on))
     maps = [load_map(name) for name in ("maze", "column", "forest")]
     seeds = [(0, 0, 0), (0, 1, 1), (0, 2, 2), (1, 1, 4), (2, 2, 8), (3, 0, 3)]

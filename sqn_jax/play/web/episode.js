@@ -13,7 +13,7 @@ import { shortestPath } from './paths.js';
  * @typedef {object} Moment one step, for the strips over time
  * @property {Float32Array} weights skill weights
  * @property {Float32Array} hidden recurrent state
- * @property {import('./env.js').Reward} reward
+ * @property {object} reward the terms and their sum, as `Env.step` returns them
  */
 
 const FEWEST_FREE_CELLS = 50;
