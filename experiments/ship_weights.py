@@ -2,11 +2,11 @@
 
 Each is named after its agent, `pretrained:sqn`, `pretrained:r2d2`, `pretrained:dqn`, or as `--name`
 says; in another folder (`--out`) it is a file that `sqn` takes as FOLDER/NAME.npz. The facts of its
-model card come from the run folder: how it was trained and what it reached right afterwards; for an
-earlier `--checkpoint` from `--evaluation`, a file of `sqn evaluate` on it. Runs it went on from,
-of which `--before` has records or cards, are named too. `--average POLICY SHARE` takes a share of
-another policy and the rest of the run: what is in between a policy and what became of it in further
-training can have the merits of both.
+model card come from the run folder: how it was trained and what it reached right afterwards, or by
+`--evaluation`, a file of `sqn evaluate` on it, which an earlier `--checkpoint` needs. Runs it went
+on from, of which `--before` has records or cards, are named too. `--average POLICY SHARE` takes a
+share of another policy and the rest of the run: what is in between a policy and what became of it
+in further training can have the merits of both.
 """
 
 from __future__ import annotations
@@ -133,15 +133,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, help="of a run of several, which (default its first)")
     parser.add_argument("--checkpoint", type=int, help="chunks after which it was saved")
     parser.add_argument("--average", nargs=2, metavar=("POLICY", "SHARE"))
-    parser.add_argument("--evaluation", type=Path, help="of that checkpoint or average")
+    parser.add_argument("--evaluation", type=Path, help="results, instead of the run's own")
     parser.add_argument("--before", nargs="+", type=Path, default=[], help="records or cards")
     options = parser.parse_args()
     if options.checkpoint is not None and options.evaluation is None:
         parser.error("--checkpoint takes an --evaluation of it")
-    if options.evaluation and options.checkpoint is None and not options.average:
-        parser.error("--evaluation goes with --checkpoint or --average")
-    if (options.name or options.checkpoint or options.average) and len(options.run_dirs) > 1:
-        parser.error("--name, --checkpoint and --average go with a single run")
+    single = (options.name, options.checkpoint, options.average, options.evaluation)
+    if any(single) and len(options.run_dirs) > 1:
+        parser.error("--name, --checkpoint, --average and --evaluation go with a single run")
     average = (options.average[0], float(options.average[1])) if options.average else None
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:

@@ -220,4 +220,4 @@ Film(gif(episode, count=4 if SMALL else 80, width_px=500))
 # - The speed printed above is that of the machine this was run on, beside other work; yours will
 #   differ.
 # - In the episode drawn, the second skill has nearly all of the weight all the way. What weights
-#   mean is the subject of the next notebook, on `pretrained:best`, which uses both skills.
+#   mean is the subject of the next notebook, on `pretrained:best`, whose gate moves more.

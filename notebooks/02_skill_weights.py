@@ -359,22 +359,23 @@ print(markdown_table(["gate", *ACTION_NAMES, "in place"], rows))
 #
 # - **The gate decides nothing here.** As trained 0.945 [0.871, 1.000] on the Maze and 0.500 [0.090,
 #   0.989] in the Cave; with skill 1 alone 0.970 [0.928, 1.000] and 0.480 [0.045, 1.000], with the
-#   weights frozen at their mean (0.682 and 0.318) 0.945 and 0.455. Of the tasks of the Cave those one
-#   way nearly all succeed and those the other way nearly all fail, hence the wide intervals.
+#   weights frozen at their mean (0.682 and 0.318) 0.945 and 0.455. Of the tasks of the Cave those
+#   one way nearly all succeed and those the other way nearly all fail, hence the wide intervals.
 # - **When skill 2 has weight.** In the Cave 0.581 with the way blocked ahead, 0.647 when stuck,
 #   0.418 on a detour, away from the goal by the shortest way; 0.229 on the direct way and nothing
 #   with the goal in reach. Compared within episodes it is higher on a detour than on the direct way
 #   by 0.189 [0.177, 0.201], when stuck by 0.233 [0.218, 0.250]. On the Maze the same with smaller
 #   numbers, 0.104 [0.090, 0.118] on a detour. This is what the paper describes.
-# - **Into a dead end it does not rise**: the difference to the direct way is 0.000 [-0.015, 0.016] in
-#   the Cave and 0.008 [-0.009, 0.027] on the Maze. The robot does not know yet that it is one.
+# - **Into a dead end it does not rise**: the difference to the direct way is 0.000 [-0.015, 0.016]
+#   in the Cave and 0.008 [-0.009, 0.027] on the Maze. The robot does not know yet that it is one.
 # - **Alone, skill 1 drives and skill 2 turns.** Skill 1 by itself bumps more in the Cave, 50.1
-#   refused moves an episode instead of 9.5. Skill 2 alone is in place in 0.609 of the steps on the Maze
-#   and reaches no goal in 400 tasks. The ensemble overrules skill 1 in 0.093 of the steps, mostly a turn
-#   that becomes forward (5,979 left, 6,007 right).
+#   refused moves an episode instead of 9.5. Skill 2 alone is in place in 0.609 of the steps on the
+#   Maze and reaches no goal in 400 tasks. The ensemble overrules skill 1 in 0.093 of the steps,
+#   mostly a turn that becomes forward (5,979 left, 6,007 right).
 # - **A simpler reading.** The Q-values of the skills are 6.16 apart, of which all but 0.35 is
 #   level, and the weight of skill 2 goes with the value of the ensemble by -0.91: the gate lowers
-#   the value where things go badly. The weight tells how well the robot expects to fare, which moves
-#   hardly any action. With one half each the two levels mix where they never did, and nearly nothing succeeds.
-# - **Not always so.** In the policy that was `pretrained:best` before, made by five runs, most of the
-#   success in the Cave hung on the gate (docs/RESULTS.md, what the skills do).
+#   the value where things go badly. The weight tells how well the robot expects to fare, which
+#   moves hardly any action. With one half each the two levels mix where they never did: 0.180 on
+#   the Maze, 0.005 in the Cave.
+# - **Not always so.** In the policy that was `pretrained:best` before, made by six runs, most of
+#   the success in the Cave hung on the gate (docs/RESULTS.md, what the skills do).

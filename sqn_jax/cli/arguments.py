@@ -115,6 +115,16 @@ def add_epsilon(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def refuse_fixed_bumper(bumper: float | None, robot: Sequence[tuple[str, float]]) -> None:
+    """Refuse --bumper beside a suite whose robot has one: the suite would win.
+
+    Raises:
+        ValueError: both say it.
+    """
+    if bumper is not None and "bumper" in dict(robot):
+        raise ValueError("--bumper: not with a file of tasks whose robot says it")
+
+
 def add_bumper(parser: argparse.ArgumentParser) -> None:
     """Add the option --bumper."""
     parser.add_argument(

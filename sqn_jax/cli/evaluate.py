@@ -17,6 +17,7 @@ from sqn_jax.cli.arguments import (
     add_params,
     integer,
     number,
+    refuse_fixed_bumper,
     single_maps,
     suite_file,
     tasks,
@@ -34,6 +35,8 @@ def evaluate(arguments: list[str]) -> int:
     options = _parser().parse_args(arguments)
     if not options.runs and options.no_baselines:
         raise ValueError("nothing to evaluate: name a run folder or pretrained:NAME")
+    if options.bumper is not None and not options.runs:
+        raise ValueError("--bumper: expected a run folder or pretrained:NAME, baselines have none")
     from sqn_jax.training import devices
 
     tasks_file = _suite_file(options)
@@ -122,6 +125,7 @@ def _evaluate_suite(options: argparse.Namespace, file: Path) -> None:
         if len(levels) > 1:
             raise ValueError(f"{option}: {len(levels)} levels, expected one with a file of tasks")
     suite = read_suite(file)
+    refuse_fixed_bumper(options.bumper, suite.robot)
     settings = SuiteSettings(
         episodes=1 if options.episodes is None else options.episodes,
         eval_seeds=options.eval_seeds,

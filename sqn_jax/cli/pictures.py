@@ -20,6 +20,7 @@ from sqn_jax.cli.arguments import (
     integer,
     number,
     pick,
+    refuse_fixed_bumper,
     single_maps,
     suite_file,
     tasks,
@@ -133,6 +134,7 @@ def render(arguments: list[str]) -> int:
 
     chosen: Any = "worst" if options.pick == ["worst"] else options.pick
     suite = read_suite(suite_name)
+    refuse_fixed_bumper(options.bumper, suite.robot)
     render_suite_session(policies, suite, folder_of_pictures, source=suite_name, pick=chosen, **how)
     return 0
 

@@ -76,7 +76,7 @@ class EnvConfig:
     reward_time: float = 0.2
     """Weight of the constant penalty of -1 a step (paper eq. 9)."""
     reward_collision: float = 0.0
-    """Weight of a penalty of -1 for each refused move; the paper has none."""
+    """Weight of a penalty of -1 for each collision; the paper has none."""
 
     def __post_init__(self) -> None:
         distances = ("max_range", "goal_radius", "max_goal_distance", "goal_distance_scale")

@@ -5,7 +5,7 @@ A robot with range beams and the goal's distance and heading moves through an oc
 Observation: `Observation(ranges [71], goal [2])`, every number in 0..1.
 Action: 0 stand still, 1 forward 2.5 m/s, 2 backward 1.25 m/s, 3 turn left pi rad/s, 4 turn right.
 Reward: 2.0 exp(-d) while the goal is reachable + 1.0 x newly covered m2 - 0.2 (paper eq. 7 to 9);
-`env.reward_collision`, 0 by default, is the penalty of a refused move.
+`env.reward_collision`, 0 by default, is the penalty of a collision.
 End: never terminated; truncated after `max_steps` steps. Reaching the goal does not end an
 episode: a mean reward of 1.35 a step, as the paper reports, is otherwise impossible.
 
@@ -154,8 +154,8 @@ def step(
     navigation = reward.navigation_reward(distance, reachable)
     exploration = reward.exploration_reward(fresh_area)
     time = reward.time_reward()
-    refused = reward.collision_reward(collision)
-    total = reward.total_reward(navigation, exploration, time, refused, params.reward_weights)
+    touch = reward.collision_reward(collision)
+    total = reward.total_reward(navigation, exploration, time, touch, params.reward_weights)
     info = {
         "reached": distance < params.goal_radius,
         "collision": collision,
@@ -165,7 +165,7 @@ def step(
         "reward_navigation": navigation,
         "reward_exploration": exploration,
         "reward_time": jnp.float32(time),
-        "reward_collision": refused,
+        "reward_collision": touch,
     }
     terminated = jnp.bool_(False)
     truncated = new_state.step >= params.max_steps
@@ -187,7 +187,7 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
             ranges = ranges + config.max_range * noise
     if config.scan_margin > 0:
         ranges = thickened(
-            ranges,
+            jnp.maximum(ranges, 0.0),
             beam_angles(config).astype(np.float32),
             margin=config.scan_margin,
             max_range=config.max_range,
@@ -241,7 +241,9 @@ def _bumper_stops(pose: Array, velocity: Array, params: EnvParams) -> Array:
         true_ranges(pose, params),
         beam_angles(config).astype(np.float32),
         velocity[0] * params.time_step,
+        radius=config.robot_radius,
         reach=config.robot_radius + config.bumper,
+        max_range=config.max_range,
     )
 
 

@@ -1,6 +1,6 @@
 """The reward of the paper (section III-C, eq. 7 to 9): navigation, exploration and time.
 
-Beside it there is a term for refused moves, which the paper lacks; its weight is 0 by default.
+Beside it there is a term for collisions, not in the paper; its weight is 0 by default.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def time_reward() -> float:
     return -1.0
 
 
-def collision_reward(refused: Array) -> Array:
-    """The penalty of a refused move: -1, else 0."""
-    return jnp.where(refused, -1.0, 0.0)
+def collision_reward(collision: Array) -> Array:
+    """The penalty of a collision: -1, else 0."""
+    return jnp.where(collision, -1.0, 0.0)
 
 
 def total_reward(

@@ -6,6 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+LEAST_AHEAD = 1e-6
+"""m; what a beam passes just beside is not ahead of it."""
+
 
 def thickened(ranges: Array, angles: ArrayLike, *, margin: float, max_range: float) -> Array:
     """Readings of the same scan if everything that a beam hits were thicker.
@@ -29,7 +32,7 @@ def thickened(ranges: Array, angles: ArrayLike, *, margin: float, max_range: flo
     hits = ranges[:, None] * directions
     ahead = directions @ hits.T  # [beams, hits] m, how far along a beam a hit lies
     aside = ranges[None] ** 2 - ahead**2
-    meets = (aside < margin**2) & (ahead > 0) & (ranges < max_range)[None]
+    meets = (aside < margin**2) & (ahead > LEAST_AHEAD) & (ranges < max_range)[None]
     entries = ahead - jnp.sqrt(jnp.maximum(margin**2 - aside, 0.0))
     nearest = jnp.where(meets, jnp.maximum(entries, 0.0), max_range).min(axis=1)
     return jnp.minimum(nearest, ranges)

@@ -301,6 +301,12 @@ def with_epsilons(agents: Sequence[TrainedAgent], epsilons: Sequence[float]) -> 
     return [named(agent, epsilon) for agent in agents for epsilon in epsilons]
 
 
+def bumper_of(agent: Agent) -> dict[str, float]:
+    """What a result says of the agent's bumper: nothing without one, as baselines are."""
+    bumper = agent.env_config.bumper if isinstance(agent, TrainedAgent) else 0.0
+    return {"bumper": bumper} if bumper > 0 else {}
+
+
 def with_baselines(agents: Sequence[Agent], *, baselines: bool) -> list[Agent]:
     """The agents, followed by the baselines, which get the robot of the first agent."""
     if not baselines:

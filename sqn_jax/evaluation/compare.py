@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from sqn_jax.baselines.shortest_paths import has_paths, require_paths
 from sqn_jax.config.map_names import MapFile, parse
 from sqn_jax.evaluation import scores
-from sqn_jax.evaluation.agents import Agent, BaselineAgent, EpisodeBatch, OnBatch, TrainedAgent
+from sqn_jax.evaluation.agents import (
+    Agent,
+    BaselineAgent,
+    EpisodeBatch,
+    OnBatch,
+    TrainedAgent,
+    bumper_of,
+)
 from sqn_jax.evaluation.cached_paths import path_lengths
 from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.settings import (
@@ -315,7 +322,7 @@ def _labels(agent: Agent, world: World, radius: float) -> dict[str, Any]:
             if config.robot_radius == agent.env_config.robot_radius
             else {"robot_radius": config.robot_radius}
         ),
-        **({"bumper": agent.env_config.bumper} if agent.env_config.bumper > 0 else {}),
+        **bumper_of(agent),
     }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sqn_jax.evaluation import statistics
-from sqn_jax.evaluation.agents import Agent, TrainedAgent
+from sqn_jax.evaluation.agents import Agent, bumper_of
 from sqn_jax.evaluation.episodes import EpisodeResults
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.settings import SuiteSettings
@@ -157,13 +157,11 @@ def contents(
 
 
 def _describe(table: SuiteTable, maps: Sequence[str]) -> dict[str, Any]:
-    is_trained = isinstance(table.agent, TrainedAgent)
-    bumper = table.agent.env_config.bumper if is_trained else 0.0
     described: dict[str, Any] = {
         "agent": table.agent.name,
         "algorithm": table.agent.algorithm,
         "epsilon": table.agent.epsilon,
-        **({"bumper": bumper} if bumper > 0 else {}),
+        **bumper_of(table.agent),
         "training_seeds": list(table.agent.training_seeds),
     }
     for name, values in table.values.items():

@@ -28,7 +28,7 @@ KNOWN_SETTINGS: dict[type[EnvConfig] | type[NetworkConfig], frozenset[str]] = {
             *("goal_distance_encoding", "goal_distance_scale"),
             *("heading_encoding", "forward_speed", "backward_speed", "turn_rate", "time_step"),
             # What a policy in use has nothing to do with, or is only described.
-            *("robot_radius", "goal_radius", "max_steps", "coverage_cell", "ray_sectors"),
+            *("robot_radius", "bumper", "goal_radius", "max_steps", "coverage_cell", "ray_sectors"),
             *("ray_iterations", "velocity_noise", "velocity_noise_unit", "range_noise"),
             *("range_noise_unit", "near_goal_fraction", "reward_navigation"),
             *("reward_exploration", "reward_time", "reward_collision"),

@@ -33,9 +33,9 @@ class Policy:
         return {key: np.frombuffer(cut[key], "<f4").reshape(header[key]["shape"]) for key in cut}
 
     def act(self, ranges, distance, heading, hidden=None, refused=None):
-        obs = np.append(ranges, [distance, heading] + [refused] * bool(self.motion_size))
+        more = [float(refused)] if self.motion_size else []  # None is a TypeError.
         hidden = np.zeros(self.size + self.motion_size) if hidden is None else hidden
-        q_values, _, after = self.step(obs, hidden)
+        q_values, _, after = self.step(np.append(ranges, [distance, heading, *more]), hidden)
         return self.commands[q_values.argmax()], hidden if np.isnan(q_values[0]) else after
 
     def step(self, obs, hidden):  # obs [R + 2 or 3] -> Q-values [5], skill weights [K], hidden

@@ -17,8 +17,9 @@ PREFIX = "params/"
 
 BEYOND: dict[str, tuple[object, ...]] = {
     "network.cell": ("gru", "refined_gru"),
+    "env.bumper": (0.0,),
 }
-"""What the page computes beyond what `sqn export` does, see `require_exportable`."""
+"""What the page computes beyond what `sqn export` does, or does not, see `require_exportable`."""
 
 LARGEST = float(np.finfo(np.float16).max)
 

@@ -134,7 +134,7 @@ def with_bumper(policy: Policy, bumper: float | None) -> Policy:
     """
     if bumper is None:
         return policy
-    require_limits(bumper, "bumper", *LIMITS["env.bumper"])
+    require_limits(bumper, "--bumper", *LIMITS["env.bumper"])
     env = dataclasses.replace(policy.config.env, bumper=bumper)
     return dataclasses.replace(policy, config=dataclasses.replace(policy.config, env=env))
 

@@ -362,6 +362,19 @@ def test_what_cannot_be_evaluated_is_one_line(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", ["evaluate", "render"])
+def test_a_bumper_is_said_by_the_suite_or_by_the_option(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "suite.json"
+    task = {"map": "maze", "start": [1.0, 1.0, None], "goal": [2.0, 1.0]}
+    contents = {"schema": 1, "name": "one", "tasks": [task], "robot": {"bumper": 0.1}}
+    file.write_text(json.dumps(contents))
+    arguments = ["pretrained:dqn", "--tasks", str(file), "--bumper", "0.05"]
+    assert main([command, *arguments, "--out", str(tmp_path / "out.json")]) == 2
+    assert "--bumper: not with a file of tasks whose robot says it" in capsys.readouterr().err
+
+
 def test_a_chunk_is_made_while_the_one_before_is_used() -> None:
     made: list[int] = []
     second_is_made = threading.Event()

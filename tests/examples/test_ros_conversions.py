@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -231,8 +232,12 @@ def test_body_and_bumper_are_those_of_the_simulator(seed: int, width: float) -> 
     ours = thickened(ranges, SECTORS, width, FAR)
     # A beam that grazes a disc meets it in one precision and not in the other.
     assert (np.abs(ours - theirs) < 5e-3).sum() >= 69
-    near = ranges / 6
+    near = np.where(ranges < FAR, ranges / 6, FAR)
     for travel in (0.25, -0.125, 0.0):
-        clearly = (is_blocked(near, SECTORS, travel, width + shift) for shift in (-1e-4, 1e-4))
-        expected = env_is_blocked(near, SECTORS, travel, reach=width)
+        body: Any = {"radius": width / 2, "max_range": FAR}
+        clearly = (
+            is_blocked(near, SECTORS, travel, reach=width + shift, **body)
+            for shift in (-1e-4, 1e-4)
+        )
+        expected = env_is_blocked(near, SECTORS, jnp.float32(travel), reach=width, **body)
         assert bool(expected) in clearly

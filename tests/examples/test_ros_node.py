@@ -20,6 +20,7 @@ from sqn_navigation.conversions import Mount, Scan
 from sqn_jax.export import sqn_policy
 
 BEAMS = np.radians(np.linspace(-175, 175, 71))
+STOPPED = Command(reason="the bumper stops the move")
 
 
 class MadeUpPolicy:
@@ -225,7 +226,7 @@ def test_the_bumper_stops_a_move_and_says_so_to_the_policy() -> None:
             # 0.25 m on, with a body of 0.1 m, 0.06 m are left to what is ahead, or 0.04 m.
             controller.set_scan(scan(ahead), Mount(), time)
             commands.append(controller.tick(lambda time=time: (time, 0.0, 0.0), time))
-        assert commands == [Command(0.5), Command(), Command(0.5)]
+        assert commands == [Command(0.5), STOPPED, Command(0.5)]
         assert [seen[4] for seen in policy.seen] == [False, False, True]  # type: ignore[misc]
         controller.set_goal((9.0, 0.0))
         controller.tick(here, 1.1)
@@ -242,7 +243,7 @@ def test_a_wide_robot_shows_its_policy_thicker_obstacles_and_stops_sooner() -> N
     controller, policy = driving(robot_radius=1.0, bumper=0.05)
     controller.set_scan(scan(ahead=1.29), Mount(), 0.0)
     policy.act = lambda *_: ((2.5, 0.0), 0)  # type: ignore[method-assign]
-    assert controller.tick(here, 0.0) == Command()
+    assert controller.tick(here, 0.0) == STOPPED
     controller, _ = driving(bumper=0.0)
     controller.set_scan(scan(ahead=1.01), Mount(), 0.0)
     assert controller.tick(here, 0.0) == Command(0.5, 0.0)

@@ -464,7 +464,7 @@ def test_every_setting_of_robot_and_network_is_known_or_refused_by_name() -> Non
             **{"gate_temperature": 2.0, "gate_balance_rate": 0.1, "embeddings": False},
             "r2d2_width_factor": 3,
         },
-        EnvConfig: {"bumper": 0.05, "scan_margin": 0.2},
+        EnvConfig: {"scan_margin": 0.2},
     }
     require_exportable(TrainConfig())
     for group, known in KNOWN_SETTINGS.items():
@@ -549,7 +549,7 @@ def test_results_of_a_run_are_those_of_its_seed_without_noise(tmp_path: Path) ->
     assert results_of(str(tmp_path), policy) == [Result("maze, random pairs", 20, 0.3, 0.75)]
     path.write_text(json.dumps({"results": [{}]}))
     assert "lacks 'algorithm'" in refusal(lambda: results_of(str(tmp_path), policy))
-    assert [result.episodes for result in results_of("pretrained:best", policy)] == [500, 500]
+    assert [result.episodes for result in results_of("pretrained:best", policy)] == [500] * 4
 
 
 def test_one_seed_of_several_must_be_named() -> None:

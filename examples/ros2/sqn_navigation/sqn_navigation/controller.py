@@ -224,10 +224,16 @@ class Controller:
         # Only a policy that was trained with motion inputs looks at its last move.
         more = {"refused": refused} if getattr(self.policy, "motion_size", 0) else {}
         velocity, self._hidden = self.policy.act(ranges, distance, heading, self._hidden, **more)
-        travel, reach = float(velocity[0]) * self.policy.time_step, self.limits.bumper
-        self._stopped = reach > 0 and is_blocked(self._ranges, angles, travel, self._radius + reach)
+        self._stopped = self.limits.bumper > 0 and is_blocked(
+            self._ranges,
+            angles,
+            float(velocity[0]) * self.policy.time_step,
+            radius=self._radius,
+            reach=self._radius + self.limits.bumper,
+            max_range=self.policy.env["max_range"],
+        )
         if self._stopped:
-            return Command()
+            return Command(reason="the bumper stops the move")
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))

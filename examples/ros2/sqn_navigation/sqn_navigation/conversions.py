@@ -121,28 +121,45 @@ def thickened(ranges: Floats, beam_angles: Floats, margin: float, max_range: flo
     """
     turns = beam_angles[:, None] - beam_angles[None]
     ahead, aside = ranges * np.cos(turns), ranges * np.sin(turns)
-    meets = (np.abs(aside) < margin) & (ahead > 0) & (ranges < max_range)
+    meets = (np.abs(aside) < margin) & (ahead > 1e-6) & (ranges < max_range)
     entries = ahead - np.sqrt(np.maximum(margin**2 - aside**2, 0.0))
     nearest = np.where(meets, np.maximum(entries, 0.0), max_range).min(axis=1)
     return np.minimum(nearest, ranges)
 
 
-def is_blocked(ranges: Floats, beam_angles: Floats, travel: float, reach: float) -> bool:
+def is_blocked(
+    ranges: Floats,
+    beam_angles: Floats,
+    travel: float,
+    *,
+    radius: float,
+    reach: float,
+    max_range: float,
+) -> bool:
     """Whether a straight move would bring the robot's center within reach of what was hit.
 
-    As `bumper.py` of `sqn_jax.env`: a robot that is nearer already may make the moves that do not
-    bring it nearer still.
+    As `bumper.py` of `sqn_jax.env`: along a wall that is nearer already, but beside the robot, it
+    may go on, and from what is nearer than its body it may drive away.
 
     Args:
-        ranges: [R] m.
+        ranges: [R] m, `max_range` where nothing is hit.
         beam_angles: [R] rad.
         travel: m, negative for a move backward.
-        reach: m, from the center.
+        radius: m, of the body; nearer readings are no place that it goes along.
+        reach: m, from the center, the radius included.
+        max_range: m.
     """
     ahead, aside = ranges * np.cos(beam_angles), ranges * np.sin(beam_angles)
     beyond = ahead - np.clip(ahead, min(travel, 0.0), max(travel, 0.0))
-    nearest = np.hypot(beyond, aside).min()
-    return bool(nearest < reach and nearest < ranges.min() - 1e-3)
+    nearest, is_hit = np.hypot(beyond, aside), ranges < max_range
+    is_approached = is_hit & (nearest < ranges - 1e-3)
+    is_beside = is_hit & (ranges >= radius) & (np.abs(aside) > 0.9 * np.abs(ahead))
+    for is_there in (aside > -0.02, aside < 0.02):
+        then = nearest[is_approached & is_there].min(initial=np.inf)
+        now = ranges[is_beside & is_there].min(initial=np.inf)
+        if then < reach and then < now - 1e-3:
+            return True
+    return False
 
 
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
