@@ -17,7 +17,7 @@ from typing import Any
 from experiments import play_page
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
-from sqn_jax.config.map_names import ProceduralMap
+from sqn_jax.config.map_names import parse
 from sqn_jax.config.presets import PAPER_MAPS, PRESETS
 from sqn_jax.evaluation.agents import TrainedAgent
 from sqn_jax.evaluation.recording import Episode, record
@@ -91,7 +91,7 @@ def failures() -> Any:
     """The tasks of its validation in which `pretrained:best` fails: the same episodes."""
     maps_tried = recorded("best_recipe_validation.json")["results"][0]["maps"]
     failed = [index for index, tried in enumerate(maps_tried) if tried["success"] == 0]
-    tasks = {index: hardest_task(ProceduralMap(*_kind(maps_tried[index]))) for index in failed}
+    tasks = {index: hardest_task(parse(maps_tried[index]["map"]).names[0]) for index in failed}
     # An episode follows from the number of its task; the others only stand in their places.
     every = tuple(tasks.get(index, tasks[failed[0]]) for index in range(len(maps_tried)))
     agent = TrainedAgent("SQN", (find_policy("pretrained:best"),))
@@ -102,11 +102,6 @@ def failures() -> Any:
     return figures.skill_trajectories(
         recorded_episodes, title="The five of 108 validation tasks that fail"
     )
-
-
-def _kind(tried: dict[str, Any]) -> tuple[str, int]:
-    kind, seed = tried["map"].split(":")
-    return kind, int(seed)
 
 
 def agents() -> Any:

@@ -6,9 +6,12 @@ import argparse
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from sqn_jax.config.map_names import parse
+
+if TYPE_CHECKING:
+    from sqn_jax.policies.run_policies import Policy
 
 TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
     "points": "evaluation points",
@@ -113,6 +116,21 @@ def add_epsilon(parser: argparse.ArgumentParser) -> None:
         metavar="E",
         help="probability of a random action in each step (default 0: greedy)",
     )
+
+
+def find_policies(options: argparse.Namespace) -> list[Policy]:
+    """The policies of `runs`, with the parameters and on the robot that other options say.
+
+    Raises:
+        ValueError: there is none of a name, it is damaged, or an option is out of its range.
+    """
+    from sqn_jax.policies.pretrained import find_policy
+    from sqn_jax.policies.run_policies import with_bumper
+
+    return [
+        with_bumper(find_policy(name, options.checkpoint, options.params), options.bumper)
+        for name in options.runs
+    ]
 
 
 def refuse_fixed_bumper(bumper: float | None, robot: Sequence[tuple[str, float]]) -> None:

@@ -15,6 +15,7 @@ from sqn_jax.cli.arguments import (
     add_device,
     add_no_baselines,
     add_params,
+    find_policies,
     integer,
     number,
     refuse_fixed_bumper,
@@ -69,14 +70,8 @@ def _suite_file(options: argparse.Namespace) -> Path | None:
 def _agents(options: argparse.Namespace) -> list[Agent]:
     """The policies, once for each epsilon, and the baselines."""
     from sqn_jax.evaluation.agents import group_policies, with_baselines, with_epsilons
-    from sqn_jax.policies.pretrained import find_policy
-    from sqn_jax.policies.run_policies import with_bumper
 
-    policies = [
-        with_bumper(find_policy(name, options.checkpoint, options.params), options.bumper)
-        for name in options.runs
-    ]
-    trained = with_epsilons(group_policies(policies), options.epsilon)
+    trained = with_epsilons(group_policies(find_policies(options)), options.epsilon)
     return with_baselines(trained, baselines=not options.no_baselines)
 
 

@@ -16,6 +16,7 @@ from sqn_jax.cli.arguments import (
     add_epsilon,
     add_no_baselines,
     add_params,
+    find_policies,
     folder,
     integer,
     number,
@@ -95,8 +96,6 @@ def render(arguments: list[str]) -> int:
     options = _render_parser().parse_args(arguments)
     if not options.runs:
         raise ValueError("nothing to render: name a run folder or pretrained:NAME")
-    from sqn_jax.policies.pretrained import find_policy
-    from sqn_jax.policies.run_policies import with_bumper
     from sqn_jax.training import devices
 
     try:
@@ -110,10 +109,7 @@ def render(arguments: list[str]) -> int:
         if options.runs.count(name) > 1:
             raise ValueError(f"{name}: comes twice, expected each run once")
     suite_name = _suite_to_draw(options)
-    policies = [
-        with_bumper(find_policy(name, options.checkpoint, options.params), options.bumper)
-        for name in options.runs
-    ]
+    policies = find_policies(options)
     map_name = options.map or "maze"
     folder_of_pictures = options.out or renders.default_folder(policies, map_name, suite_name)
     how: dict[str, Any] = {

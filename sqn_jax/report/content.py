@@ -79,8 +79,7 @@ def read_runs(
     Raises:
         ValueError: a run is missing or damaged, or the bumper is out of range.
     """
-    read = [_read_run(name, checkpoint, params) for name in names]
-    runs = [replace(run, policy=with_bumper(run.policy, bumper)) for run in read]
+    runs = [_read_run(name, checkpoint, params, bumper) for name in names]
     counts = Counter(run.name for run in runs)
     return [
         replace(run, name=name, policy=replace(run.policy, name=name))
@@ -90,8 +89,8 @@ def read_runs(
     ]
 
 
-def _read_run(name: str, checkpoint: int | str, params: WhichParams) -> Run:
-    policy = find_policy(name, checkpoint, params)
+def _read_run(name: str, checkpoint: int | str, params: WhichParams, bumper: float | None) -> Run:
+    policy = with_bumper(find_policy(name, checkpoint, params), bumper)
     if not names_a_run(name):
         return Run(name, policy, [], {}, name)
     folder, _ = RunFolder.open(Path(name))
