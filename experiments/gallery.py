@@ -17,7 +17,7 @@ from typing import Any
 from experiments import play_page
 from experiments.common import ALGORITHMS, recorded, run
 from sqn_jax import figures
-from sqn_jax.config.map_names import parse
+from sqn_jax.config.map_names import ProceduralMap, parse
 from sqn_jax.config.presets import PAPER_MAPS, PRESETS
 from sqn_jax.evaluation.agents import TrainedAgent
 from sqn_jax.evaluation.recording import Episode, record
@@ -91,7 +91,8 @@ def failures() -> Any:
     """The tasks of its validation in which `pretrained:best` fails: the same episodes."""
     maps_tried = recorded("best_recipe_validation.json")["results"][0]["maps"]
     failed = [index for index, tried in enumerate(maps_tried) if tried["success"] == 0]
-    tasks = {index: hardest_task(parse(maps_tried[index]["map"]).names[0]) for index in failed}
+    maps = {index: parse(maps_tried[index]["map"]).names[0] for index in failed}
+    tasks = {i: hardest_task(name) for i, name in maps.items() if isinstance(name, ProceduralMap)}
     # An episode follows from the number of its task; the others only stand in their places.
     every = tuple(tasks.get(index, tasks[failed[0]]) for index in range(len(maps_tried)))
     agent = TrainedAgent("SQN", (find_policy("pretrained:best"),))

@@ -33,9 +33,9 @@ QUIET_CALLS = {
 PLOTTING_LIBRARIES = {"imageio", "matplotlib"}
 PLOTTING = ("sqn_jax/figures/", "sqn_jax/report/")
 JIT = (
-    "sqn_jax/training/loop.py",
+    *("sqn_jax/training/loop.py", "sqn_jax/training/exported.py"),
     *("sqn_jax/evaluation/baseline_episodes.py", "sqn_jax/evaluation/episodes.py"),
-    "sqn_jax/evaluation/recording.py",
+    *("sqn_jax/evaluation/recording.py", "sqn_jax/evaluation/settings.py"),
     *("sqn_jax/policies/greedy.py", "sqn_jax/export/rollout.py", "sqn_jax/adapters/programs.py"),
     *("experiments/bench_simulator.py", "experiments/bench_learner.py"),
     *("experiments/bench_adapters.py", "examples/purejaxrl_ppo.py"),
@@ -43,7 +43,7 @@ JIT = (
     *("experiments/bench_breakdown.py", "experiments/check_gpu.py", "notebooks/01_first_steps.py"),
 )
 """Files that make compiled programs; jit elsewhere would nest and hide what compiles."""
-JIT_NAMES = {"jit", "pjit", "pmap"}
+JIT_NAMES = {"jit", "pjit", "pmap", "exported_jit"}
 UNSAFE_IMPORTS = {
     *("cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"),
     *("ftplib", "http", "requests", "socket", "urllib"),

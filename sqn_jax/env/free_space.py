@@ -27,6 +27,11 @@ CELLS_AT_ONCE = 2**14
 """Cells whose rectangles are looked for together: few enough for the processor's caches."""
 
 
+def table(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDArray[np.int16]:
+    """The table that a ray reads, [sectors, H, W]: `far_sides` of `free_rectangles`."""
+    return far_sides(free_rectangles(blocked, sectors, reach))
+
+
 def free_rectangles(blocked: NDArray[np.bool_], sectors: int, reach: int) -> NDArray[np.uint16]:
     """Build the table.
 

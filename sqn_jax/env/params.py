@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import jax
+import numpy as np
 from flax import struct
 from jax import Array
+from numpy.typing import ArrayLike, DTypeLike
 
 from sqn_jax.config import EnvConfig
 from sqn_jax.env.coverage import Lattice
 from sqn_jax.env.raycast import RayGrid
+
+
+def on_device(values: ArrayLike, dtype: DTypeLike) -> Array:
+    """Numbers of the host on the device; `jnp.asarray` would compile a program for each shape."""
+    return jax.device_put(np.asarray(values, dtype))
 
 
 @struct.dataclass

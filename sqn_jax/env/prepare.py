@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from sqn_jax.config import EnvConfig
 from sqn_jax.env.arithmetic import LARGEST_INTEGER, require_single_precision
 from sqn_jax.env.coverage import Lattice
-from sqn_jax.env.free_space import far_sides, free_rectangles
-from sqn_jax.env.params import EnvParams
+from sqn_jax.env.free_space import table
+from sqn_jax.env.params import EnvParams, on_device
 from sqn_jax.env.raycast import RayGrid
 from sqn_jax.maps import (
     MAX_CELLS,
@@ -92,18 +93,18 @@ def make_env(
             occupancy_map.occupied, occupancy_map.resolution, config.ray_sectors, config.max_range
         ),
         body=_ray_grid(~body_free, occupancy_map.resolution, BODY_SECTORS, max(longest_move, 1.0)),
-        spawn_positions=jnp.asarray(positions, jnp.float32),
-        spawn_counts=jnp.asarray(counts, jnp.int32),
-        start_points=jnp.asarray(np.repeat(np.arange(len(parts)), weights[parts]), jnp.int32),
-        spawn_groups=jnp.asarray(groups, jnp.int32),
-        spawn_neighbors=jnp.asarray(_nearest(middles, groups), jnp.int32),
-        near_goal_fraction=jnp.float32(config.near_goal_fraction),
-        commands=jnp.asarray(commands_of(config)),
-        time_step=jnp.float32(config.time_step),
-        goal_radius=jnp.float32(config.goal_radius),
+        spawn_positions=on_device(positions, np.float32),
+        spawn_counts=on_device(counts, np.int32),
+        start_points=on_device(np.repeat(np.arange(len(parts)), weights[parts]), np.int32),
+        spawn_groups=on_device(groups, np.int32),
+        spawn_neighbors=on_device(_nearest(middles, groups), np.int32),
+        near_goal_fraction=on_device(config.near_goal_fraction, np.float32),
+        commands=on_device(commands_of(config), np.float32),
+        time_step=on_device(config.time_step, np.float32),
+        goal_radius=on_device(config.goal_radius, np.float32),
         velocity_noise=_velocity_noise(config),
-        range_noise=jnp.float32(config.range_noise),
-        reward_weights=jnp.asarray(reward_weights_of(config)),
+        range_noise=on_device(config.range_noise, np.float32),
+        reward_weights=on_device(reward_weights_of(config), np.float32),
         mirrored=None,
         config=config,
         max_steps=config.max_steps or occupancy_map.max_steps,
@@ -186,7 +187,7 @@ def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> 
     return dataclasses.replace(
         params,
         velocity_noise=_velocity_noise(env_config),
-        range_noise=jnp.float32(range_noise),
+        range_noise=on_device(range_noise, np.float32),
         config=compiled_in,
     )
 
@@ -194,7 +195,7 @@ def with_noise(params: EnvParams, velocity_noise: float, range_noise: float) -> 
 def _velocity_noise(config: EnvConfig) -> Array:
     speed = np.array([config.forward_speed, config.turn_rate], np.float32)
     unit = speed if config.velocity_noise_unit == "relative" else np.ones(2, np.float32)
-    return jnp.asarray(config.velocity_noise * unit, jnp.float32)
+    return on_device(config.velocity_noise * unit, np.float32)
 
 
 def _ray_grid(
@@ -210,19 +211,34 @@ def _ray_grid(
         )
     return RayGrid(
         far_sides=_table(blocked.tobytes(), blocked.shape, sectors, reach),
-        first_entry=jnp.int32(0),
-        resolution=jnp.float32(resolution),
-        width=jnp.int32(width),
+        first_entry=on_device(0, np.int32),
+        resolution=on_device(resolution, np.float32),
+        width=on_device(width, np.int32),
         sectors=sectors,
     )
+
+
+TableSource = Callable[[NDArray[np.bool_], int, int], NDArray[np.int16]]
+"""From blocked cells [H, W], sectors and reach to `free_space.table`."""
+
+_table_source: list[TableSource] = [table]
+
+
+@contextmanager
+def tables_from(source: TableSource) -> Iterator[None]:
+    """Take the tables of maps from here within this context; they must be those of `table`."""
+    _table_source.append(source)
+    try:
+        yield
+    finally:
+        _table_source.pop()
 
 
 @lru_cache(maxsize=2)
 def _table(blocked: bytes, shape: tuple[int, int], sectors: int, reach: int) -> Array:
     """The table of a `RayGrid`; those of the last map are kept, for its other kinds of tasks."""
-    cells = np.frombuffer(blocked, np.bool_).reshape(shape)
-    sides = far_sides(free_rectangles(cells, sectors, reach))
-    return jnp.asarray(np.moveaxis(sides, 0, -1).reshape(-1))
+    sides = _table_source[-1](np.frombuffer(blocked, np.bool_).reshape(shape), sectors, reach)
+    return on_device(np.moveaxis(sides, 0, -1).reshape(-1), np.int16)
 
 
 def _groups(parts: NDArray[np.int64]) -> NDArray[np.int64]:

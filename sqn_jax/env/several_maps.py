@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from sqn_jax.env.coverage import Lattice
-from sqn_jax.env.params import EnvParams
+from sqn_jax.env.params import EnvParams, on_device
 from sqn_jax.env.raycast import RayGrid
 
 _OF_A_MAP = ("first_entry", "resolution", "width")
@@ -57,7 +57,7 @@ def without_spawn_points(env_params: EnvParams) -> EnvParams:
     """
 
     def one_entry(array: Array) -> Array:
-        return jnp.zeros((1,) * array.ndim, array.dtype)
+        return on_device(np.zeros((1,) * array.ndim), array.dtype)
 
     return dataclasses.replace(
         env_params,
@@ -76,8 +76,8 @@ def _join(grids: Sequence[RayGrid]) -> RayGrid:
     np.concatenate(entries, out=joined[: ends[-1]])
     return dataclasses.replace(
         grids[0],
-        far_sides=jnp.asarray(joined),
-        first_entry=jnp.asarray(np.append(0, ends[:-1]), jnp.int32),
+        far_sides=on_device(joined, np.int16),
+        first_entry=on_device(np.append(0, ends[:-1]), np.int32),
         resolution=jnp.stack([grid.resolution for grid in grids]),
         width=jnp.stack([grid.width for grid in grids]),
     )

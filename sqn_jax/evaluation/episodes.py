@@ -23,6 +23,7 @@ from sqn_jax.agent.trajectory import Trajectory, over_robots
 from sqn_jax.env import EnvParams, EnvState, Observation, reset_to, sample_task
 from sqn_jax.env.randomize import robot_axes
 from sqn_jax.env.several_maps import select_maps, without_spawn_points
+from sqn_jax.training.exported import exported_jit
 from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
@@ -38,6 +39,7 @@ BATCH = 100
 """Episodes that run at once."""
 
 
+@partial(jax.jit, static_argnames="num_episodes")
 def episode_keys(key: Array, num_episodes: int) -> Array:
     """One key for each episode, [E]; key i does not depend on the number of episodes."""
     return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(num_episodes))
@@ -59,7 +61,7 @@ class GivenTasks:
     """[E] m."""
 
 
-@jax.jit
+@exported_jit
 def draw_tasks(keys: Array, env_params: EnvParams) -> tuple[Array, Array]:
     """The starts [E, 3] and goals [E, 2] that the episodes of keys [E] have in a world.
 
@@ -170,7 +172,7 @@ def run_seeds(
     for first in range(0, len(keys), BATCH):
         count = min(BATCH, len(keys) - first)
         chosen = first + np.arange(BATCH) % count  # The rest of a batch is padding.
-        own_keys, own_tasks = keys[chosen], jax.tree.map(lambda x, i=chosen: x[i], tasks)
+        own_keys, own_tasks = _rows((keys, tasks), chosen)
         if own_tasks is None:
             places = draw_tasks(own_keys, env_params)
         else:
@@ -242,7 +244,13 @@ def _groups(params: Params) -> list[Params]:
     return [jax.tree.map(lambda x, i=i: x[i : i + 1], params) for i in range(num_policies)]
 
 
-@partial(jax.jit, static_argnames="network")
+@jax.jit
+def _rows(arrays: Any, chosen: NDArray[np.integer]) -> Any:
+    """These rows of each array of a tree: one program where indexing would be a handful."""
+    return jax.tree.map(lambda x: x[chosen], arrays)
+
+
+@exported_jit(static_argname="network")
 def _run_batch(
     keys: Array,
     starts: Array,
@@ -280,7 +288,7 @@ def metrics_of(trajectory: Trajectory, goal_radii: Sequence[float]) -> list[Epis
     """
     judged = trajectory.only("rewards", "poses", "info")
     on_host: list[EpisodeMetrics] = jax.device_get(
-        [_metrics(judged, jnp.float32(radius)) for radius in goal_radii]
+        [_metrics(judged, np.float32(radius)) for radius in goal_radii]
     )
     return on_host
 
@@ -290,7 +298,7 @@ def task_metrics(
 ) -> EpisodeMetrics:
     """`episode_metrics` by the limits of each task; NumPy arrays [E]."""
     judged = trajectory.only("rewards", "poses", "info")
-    ends = jnp.bool_(collision_ends)
+    ends = np.bool_(collision_ends)
     on_host: EpisodeMetrics = jax.device_get(
         _metrics(judged, tasks.goal_radii, tasks.max_steps, ends)
     )

@@ -37,6 +37,7 @@ from sqn_jax.evaluation.settings import (
 )
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.exported import exported_jit
 
 Floats = NDArray[np.floating]
 
@@ -297,7 +298,7 @@ def record_episodes(
     ]
 
 
-@jax.jit
+@exported_jit
 def covered_points(poses: Array, env_params: EnvParams) -> Array:
     """[T + 1, E, ...] the points covered along poses [T + 1, E, 3]."""
     return jax.vmap(covered_along, in_axes=(1, None), out_axes=1)(poses, env_params)

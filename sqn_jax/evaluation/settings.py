@@ -165,4 +165,10 @@ def worlds(robot: EnvConfig, maps: Maps, settings: Settings) -> Iterator[World]:
 
 def task_key(eval_seed: int, tasks: Tasks) -> jax.Array:
     """The key of the episodes of an evaluation seed; it is the same for every agent."""
-    return jax.random.fold_in(jax.random.key(eval_seed), list(SPAWN_MODES).index(tasks))
+    return stream_key(eval_seed, list(SPAWN_MODES).index(tasks))
+
+
+@jax.jit
+def stream_key(seed: int, stream: int) -> jax.Array:
+    """The key of a stream of a seed; streams are independent of each other."""
+    return jax.random.fold_in(jax.random.key(seed), stream)

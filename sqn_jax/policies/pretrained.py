@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
@@ -145,7 +144,7 @@ def read_policy(folder: Path, name: str) -> Policy:
         raise ValueError(f"policy {name}: cannot be read ({one_line(error)})") from None
     params = traverse_util.unflatten_dict(arrays, sep="/")
     require_finite(params, f"policy {name}")
-    return Policy(name, config, (jax.tree.map(jnp.asarray, params),))
+    return Policy(name, config, (jax.device_put(params),))
 
 
 def card_of(name: str) -> dict[str, Any]:

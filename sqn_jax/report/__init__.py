@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.outside.messages import say
 from sqn_jax.report.content import Run, gather_content, read_runs
@@ -16,7 +17,6 @@ from sqn_jax.report.page import to_html
 from sqn_jax.report.pictures import draw_pictures
 from sqn_jax.report.play import path_beside, worst_to_play
 from sqn_jax.storage import html
-from sqn_jax.storage.compile_cache import cached_programs
 
 __all__ = ["Run", "read_runs", "require_writable", "write_report"]
 
@@ -32,7 +32,7 @@ def require_writable(out: Path) -> None:
     html.require_writable(path_beside(out))
 
 
-@cached_programs()
+@cached_work()
 def write_report(
     runs: Sequence[Run],
     settings: Settings,

@@ -17,6 +17,7 @@ from sqn_jax import figures
 from sqn_jax.config import EnvConfig
 from sqn_jax.config.map_names import parse
 from sqn_jax.evaluation.agents import TrainedAgent, with_epsilons
+from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.compare import load_maps
 from sqn_jax.evaluation.episodes import episode_keys
 from sqn_jax.evaluation.recording import Episode, record_episodes
@@ -25,7 +26,6 @@ from sqn_jax.figures import animation
 from sqn_jax.figures.skills import MAX_AGENTS, MAX_TASKS
 from sqn_jax.outside.messages import say
 from sqn_jax.policies.run_policies import Policy
-from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import probe_writable, written_whole
 
 MOST_EPISODES = 32
@@ -34,7 +34,7 @@ MOST_EPISODES = 32
 EpisodesByAgent = Mapping[str, list[Episode]]
 
 
-@cached_programs()
+@cached_work()
 def render_session(
     policies: Sequence[Policy],
     out: Path,

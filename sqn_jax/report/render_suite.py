@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sqn_jax.evaluation.agents import TrainedAgent
+from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.evaluation.suite_recording import first_try, record_tasks
 from sqn_jax.evaluation.suites import SuiteMaps, evaluate_suite, num_episodes, robot_for
@@ -16,11 +17,10 @@ from sqn_jax.policies.run_policies import Policy
 from sqn_jax.report.render import draw, make_folder, named_agents, outcome, require_drawable
 from sqn_jax.runs.evaluate import suite_maps
 from sqn_jax.runs.progress import episodes_bar
-from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.tasks import TaskSuite
 
 
-@cached_programs()
+@cached_work()
 def render_suite_session(
     policies: Sequence[Policy],
     suite: TaskSuite,

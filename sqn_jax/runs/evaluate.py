@@ -9,6 +9,7 @@ from typing import Any
 
 from sqn_jax.baselines.shortest_paths import require_paths
 from sqn_jax.evaluation.agents import Agent
+from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.compare import (
     RECORD_BYTES,
     OnEvaluated,
@@ -22,13 +23,12 @@ from sqn_jax.evaluation.suites import SuiteMaps, evaluate_suite, robot_for
 from sqn_jax.evaluation.suites import num_episodes as num_suite_episodes
 from sqn_jax.maps import load_map
 from sqn_jax.runs.progress import episodes_bar
-from sqn_jax.storage.compile_cache import cached_programs
 from sqn_jax.storage.files import write_json, write_records
 from sqn_jax.tasks import TaskSuite, check_tasks
 from sqn_jax.training import memory_budget
 
 
-@cached_programs()
+@cached_work()
 def evaluate_session(
     agents: Sequence[Agent],
     settings: Settings,
@@ -65,7 +65,7 @@ def evaluate_session(
     return evaluation
 
 
-@cached_programs()
+@cached_work()
 def evaluate_suite_session(
     agents: Sequence[Agent],
     suite: TaskSuite,

@@ -20,7 +20,7 @@ from sqn_jax.agent.networks import Params
 from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.episodes import episode_keys, run_seeds
 from sqn_jax.evaluation.paper_results import paper_reward
-from sqn_jax.evaluation.settings import World, robot_for, worlds
+from sqn_jax.evaluation.settings import World, robot_for, stream_key, worlds
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.runs.final_evaluation import settings_of
 from sqn_jax.storage.metrics import evaluated_rows
@@ -91,8 +91,7 @@ class LearningCurve:
 
 def curve_keys(config: TrainConfig) -> jax.Array:
     """The keys [E] of the episodes, the same at every point and for every training seed."""
-    stream = jax.random.fold_in(jax.random.key(config.eval.seed), CURVE_STREAM)
-    return episode_keys(stream, config.eval.curve_episodes)
+    return episode_keys(stream_key(config.eval.seed, CURVE_STREAM), config.eval.curve_episodes)
 
 
 def stacked_params(learner: LearnerState, config: TrainConfig) -> Params:

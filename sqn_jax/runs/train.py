@@ -25,6 +25,7 @@ from sqn_jax.agent.program import Program
 from sqn_jax.config import TrainConfig
 from sqn_jax.config.map_names import MapFile
 from sqn_jax.env import EnvParams, make_env
+from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.maps import OccupancyMap, load_map, step_warning
 from sqn_jax.outside.messages import say
 from sqn_jax.outside.reading import read_at_most
@@ -39,7 +40,7 @@ from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
 from sqn_jax.storage import lock, manifest
 from sqn_jax.storage.checkpoint import Checkpoints, chunks_in
-from sqn_jax.storage.compile_cache import cached_programs, watched_compilation
+from sqn_jax.storage.compile_cache import watched_compilation
 from sqn_jax.storage.lock import locked
 from sqn_jax.storage.manifest import Origin
 from sqn_jax.storage.run_folder import CHECKPOINTS, RunFolder, require_usable
@@ -62,7 +63,7 @@ MAX_PICTURE_BYTES = 2**25
 """Size of a figure for TensorBoard, at most."""
 
 
-@cached_programs()
+@cached_work()
 def train_session(
     config: TrainConfig,
     run_dir: Path,

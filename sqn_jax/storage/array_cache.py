@@ -64,6 +64,17 @@ def _checksum(packed: bytes) -> bytes:
     return hashlib.sha256(packed).hexdigest().encode()
 
 
+def code_of_package(package: ModuleType, *libraries: ModuleType) -> bytes:
+    """A digest of all source of a package and of the versions of libraries."""
+    root = Path(str(package.__file__)).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes() + b"\0")
+    for library in libraries:
+        digest.update(f"{library.__name__} {library.__version__}\0".encode())
+    return digest.digest()
+
+
 def code_of(*modules: ModuleType) -> bytes:
     """A digest of the source of modules and of the libraries: with others numbers may be others.
 

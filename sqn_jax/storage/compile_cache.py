@@ -175,17 +175,26 @@ def _tidy(folder: Path) -> None:
 def _sealed(folder: Path) -> Iterator[None]:
     """Put a checksum beside every program as soon as it is written: the run may be killed."""
 
-    def seal(event: str, *_: object, **__: object) -> None:
-        for entry in folder.glob(f"*{ENTRY}") if event.endswith("compile_duration") else ():
-            with suppress(OSError, ValueError):
-                if not seal_of(entry).exists():
-                    seal_of(entry).write_bytes(_digest(entry))
+    seen: list[int] = []
+
+    def seal(event: str = "compile_duration", *_: object, **__: object) -> None:
+        with suppress(OSError):
+            # A folder changes when a file is added; to look through all of its files takes longer.
+            if not event.endswith("compile_duration") or seen == [folder.stat().st_mtime_ns]:
+                return
+            for entry in folder.glob(f"*{ENTRY}"):
+                with suppress(OSError, ValueError):
+                    if not seal_of(entry).exists():
+                        seal_of(entry).write_bytes(_digest(entry))
+            seen[:] = [folder.stat().st_mtime_ns]
 
     jax.monitoring.register_event_duration_secs_listener(seal)
     try:
         yield
     finally:
         jax.monitoring.unregister_event_duration_listener(seal)
+        seen.clear()  # The clock of a file system may stand still for some milliseconds.
+        seal()
 
 
 def seal_of(entry: Path) -> Path:

@@ -33,6 +33,7 @@ from sqn_jax.config import TrainConfig
 from sqn_jax.env import NUM_ACTIONS, EnvParams
 from sqn_jax.training.curriculum import by_learnability, with_outcomes
 from sqn_jax.training.devices import own_part, place, placed_shapes
+from sqn_jax.training.exported import exported_jit
 from sqn_jax.training.rollout import (
     ActorState,
     EpisodeMetrics,
@@ -149,8 +150,9 @@ def _rollout_metrics(episodes: EpisodeMetrics, trajectory: Trajectory) -> Metric
 def _is_finite(learner: LearnerState) -> Array:
     """Whether all that learning has made is numbers."""
     made = (learner.params, learner.target_params, learner.opt_state)
-    floats = [x for x in jax.tree.leaves(made) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats]))
+    floats = [x.ravel() for x in jax.tree.leaves(made) if jnp.issubdtype(x.dtype, jnp.floating)]
+    # Together: one by one they would be a quarter of all that XLA has to compile.
+    return jnp.isfinite(jnp.concatenate(floats)).all()
 
 
 def train_chunk(
@@ -205,7 +207,7 @@ def _for_each_seed(function: Callable[..., Any], runner: RunnerState) -> Any:
     return jax.tree.map(lambda x: x[None], results)
 
 
-_jitted_train_chunk = jax.jit(train_chunk, static_argnames="program", donate_argnames="runner")
+_compiled_train_chunk = exported_jit(train_chunk, static_argname="program", donate_argname="runner")
 
 
 def start_run(program: Program) -> RunnerState:
@@ -217,7 +219,7 @@ def start_run(program: Program) -> RunnerState:
     return place(_start_run(program), program.mesh, runner_specs(program))
 
 
-@partial(jax.jit, static_argnames="program")
+@exported_jit(static_argname="program")
 def _start_run(program: Program) -> RunnerState:
     config = program.config
     if config.num_seeds == 1:
@@ -257,7 +259,7 @@ def compile_chunk(env_params: EnvParams, program: Program) -> tuple[CompiledChun
     started = time.perf_counter()
     world = placed_shapes(jax.eval_shape(lambda x: x, env_params), program.mesh)
     runner = runner_shapes(program)
-    compiled = _jitted_train_chunk.lower(runner, world, program).compile()
+    compiled = _compiled_train_chunk.compile(runner, world, program)
     return compiled, time.perf_counter() - started
 
 

@@ -77,8 +77,13 @@ def params_shapes(config: TrainConfig) -> Params:
         ValueError: the network is larger than any that is trained here.
     """
     _require_sensible(config)
-    obs, carry = example_obs(config), initial_carry(config.network, 1)
-    shapes = jax.eval_shape(network_of(config).init, jax.random.key(0), obs, carry)
+
+    def init() -> Params:
+        obs, carry = example_obs(config), initial_carry(config.network, 1)
+        params: Params = network_of(config).init(jax.random.key(0), obs, carry)
+        return params
+
+    shapes = jax.eval_shape(init)
     seeds = () if config.num_seeds == 1 else (config.num_seeds,)
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), shapes)
 
