@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sqn_jax.storage import array_cache, compile_cache
-from sqn_jax.storage.array_cache import cached_arrays, code_of
+from sqn_jax.storage.array_cache import cached_arrays, code_of, code_of_package
 from sqn_jax.storage.compile_cache import cached_programs
 
 
@@ -159,3 +159,28 @@ def test_other_code_is_something_else(tmp_path: Path) -> None:
         modules.append(module)
     assert code_of(modules[0]) != code_of(modules[1])
     assert code_of(modules[0]) == code_of(modules[0])
+
+
+def test_a_package_is_another_with_any_file_name_or_library(tmp_path: Path) -> None:
+    package, library = ModuleType("package"), ModuleType("library")
+    package.__file__ = str(tmp_path / "__init__.py")
+    library.__version__ = "1.0"  # type: ignore[attr-defined]
+    (tmp_path / "inner").mkdir()
+    digests = []
+
+    def note() -> None:
+        digests.append(code_of_package(package, library))
+
+    for name, text in (
+        *(("__init__.py", ""), ("inner/a.py", "x = 1\n"), ("inner/a.py", "x = 2\n")),
+        *(("inner/b.py", ""), ("c.py", "")),
+    ):
+        (tmp_path / name).write_text(text)
+        note()
+    (tmp_path / "inner" / "b.py").rename(tmp_path / "b.py")
+    note()
+    library.__version__ = "1.1"  # type: ignore[attr-defined]
+    note()
+    assert len(set(digests)) == len(digests)
+    (tmp_path / "inner" / "notes.txt").write_text("no code")
+    assert code_of_package(package, library) == digests[-1]
