@@ -11,6 +11,7 @@ Nothing is loaded before it is asked for: `import sqn_jax` and `sqn --help` star
 from __future__ import annotations
 
 import importlib
+import time
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ __all__ = [
 ]
 
 _POLICIES = ("GreedyPolicy", "load_policy")
+
+_IMPORTED = time.time()
+"""When the first module of this package was imported, s since the epoch."""
 
 
 def __getattr__(name: str) -> Any:

@@ -19,9 +19,8 @@ TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
 }
 
 CACHE = (
-    "Compiled programs and plans of the oracle are stored in the user's cache folder for the next "
-    "start. The environment "
-    "variable SQN_JAX_CACHE=DIR selects another folder; SQN_JAX_CACHE=off stores none."
+    "Programs, tables of maps and plans of the oracle are stored in the user's cache folder for "
+    "the next start. The environment variable SQN_JAX_CACHE=DIR selects another folder; SQN_JAX_CACHE=off stores none."
 )
 
 

@@ -217,7 +217,7 @@ def _given_tasks(
     for row, (task, number) in enumerate(zip(tasks, which, strict=True)):
         occupancy_map = maps[number]
         start, goal = occupancy_map.to_grid_frame([task.start, task.goal])
-        starts[row, :2] = on_device(start, occupancy_map.resolution)
+        starts[row, :2] = single_precision(start, occupancy_map.resolution)
         yaw = occupancy_map.origin[2]
         starts[row, 2] = np.nan if task.heading is None else task.heading - yaw
         goals[row] = goal
@@ -231,7 +231,7 @@ def _given_tasks(
     )
 
 
-def on_device(point: NDArray[np.float64], resolution: float) -> NDArray[np.float32]:
+def single_precision(point: NDArray[np.float64], resolution: float) -> NDArray[np.float32]:
     """A place to start from in single precision, in the cell that it has in double precision.
 
     Rounding can put a place on the border of a cell across it, into an obstacle; then it is the

@@ -1,12 +1,13 @@
 """Arrays that take long to compute, kept beside the compiled programs for the next start.
 
-They are sealed, tidied and switched off as the programs are (`compile_cache`). Nothing of them is
-executed.
+They are sealed, tidied and switched off as the programs are (`compile_cache`), and as private: some
+of them hold programs (`training.exported`).
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -49,6 +50,7 @@ def cached_arrays(
     with suppress(OSError, ValueError):
         packed = read_at_most(entry, LARGEST_FILE, "kept arrays", follow=False)
         if read_at_most(seal, 64, "a checksum", follow=False) == _checksum(packed):
+            os.utime(entry, follow_symlinks=False)  # What is oldest is deleted first.
             return read_arrays(packed, read_headers(packed))
     arrays = dict(make())
     packed = packed_arrays(arrays)
@@ -65,14 +67,23 @@ def _checksum(packed: bytes) -> bytes:
 
 
 def code_of_package(package: ModuleType, *libraries: ModuleType) -> bytes:
-    """A digest of all source of a package and of the versions of libraries."""
+    """A digest of all source of a package, and of its version and those of libraries."""
     root = Path(str(package.__file__)).parent
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes() + b"\0")
-    for library in libraries:
-        digest.update(f"{library.__name__} {library.__version__}\0".encode())
+    for module in (package, *libraries):
+        digest.update(f"{module.__name__} {module.__version__}\0".encode())
     return digest.digest()
+
+
+def is_edited(package: ModuleType, since: float) -> bool:
+    """Whether a source file of a package is newer than a time, s since the epoch.
+
+    What was imported before may then be other code than what the file holds.
+    """
+    root = Path(str(package.__file__)).parent
+    return any(path.stat().st_mtime > since for path in root.rglob("*.py"))
 
 
 def code_of(*modules: ModuleType) -> bytes:

@@ -160,7 +160,8 @@ def _tidy(folder: Path) -> None:
         seal, is_arrays = seal_of(entry), entry.name.startswith(ARRAYS)
         is_sealed = os.path.lexists(seal)  # Else a process was killed before it was finished.
         sound = is_sealed and _is_sound(entry, seal)
-        damaged += is_sealed and not sound
+        # Two commands that begin at once may write the two files of the same arrays in any order.
+        damaged += is_sealed and not sound and not is_arrays
         bytes_left[is_arrays] -= entry.lstat().st_size if sound else 0
         if not sound or bytes_left[is_arrays] < 0:
             for path in (entry, seal):

@@ -2,7 +2,8 @@
 
 JAX caches what it compiles, but traces and lowers a program in every process: seconds of Python,
 more than it takes to read what was compiled. `exported_jit` has `jax.export` write the lowered
-program once. Where no command has set a cache (`exports_in`), it is `jax.jit`.
+program once. Without a cache (`exports_in`), on accelerators and in runs of several processes it is
+`jax.jit`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import jax
 import numpy as np
 from jax import export
 from numpy.typing import NDArray
+
+from sqn_jax.outside.messages import say
 
 Arrays = Mapping[str, NDArray[Any]]
 Cache = Callable[[str, Iterable[bytes], Callable[[], Arrays]], Arrays]
@@ -105,15 +108,20 @@ class ExportedJit:
             *(repr(names), str(tree), repr([_description(shape) for shape in shapes])),
             *(repr(static), repr(_settings())),
         ]
-        arrays = _caches[-1](
-            "programs",
-            [text.encode() for text in depends_on],
-            lambda: _packed(export.export(jax.jit(flat))(*shapes)),
-        )
-        program = _unpacked(arrays)
+        try:
+            arrays = _caches[-1](
+                "programs",
+                [text.encode() for text in depends_on],
+                lambda: _packed(export.export(jax.jit(flat))(*shapes)),
+            )
+            run = _unpacked(arrays).call
+        except Exception as error:  # A library is missing, or the file holds something else.
+            reason = " ".join(str(error).split())
+            say(f"{self._function.__name__} is traced anew in each process: {reason}", error=True)
+            run = flat
 
         def call(*arguments: Any) -> Any:
-            return program.call(*jax.tree.leaves(arguments))
+            return run(*jax.tree.leaves(arguments))
 
         call.__name__ = self._function.__name__
         donated = names.index(self._donated) if self._donated else None

@@ -150,9 +150,8 @@ def _rollout_metrics(episodes: EpisodeMetrics, trajectory: Trajectory) -> Metric
 def _is_finite(learner: LearnerState) -> Array:
     """Whether all that learning has made is numbers."""
     made = (learner.params, learner.target_params, learner.opt_state)
-    floats = [x.ravel() for x in jax.tree.leaves(made) if jnp.issubdtype(x.dtype, jnp.floating)]
-    # Together: one by one they would be a quarter of all that XLA has to compile.
-    return jnp.isfinite(jnp.concatenate(floats)).all()
+    floats = [x for x in jax.tree.leaves(made) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats]))
 
 
 def train_chunk(

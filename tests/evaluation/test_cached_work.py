@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tomllib
 from pathlib import Path
 from unittest import mock
 
@@ -9,12 +11,16 @@ import jax
 import numpy as np
 import pytest
 
+import sqn_jax
 from sqn_jax.env import free_space, make_env, prepare
 from sqn_jax.evaluation.agents import TrainedAgent
 from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.training import exported
+
+ROOT = Path(__file__).parents[2]
 
 MOST_PROGRAMS = 7
 """Of an evaluation: keys, tasks, episodes, metrics. A dozen tiny ones would take a second more."""
@@ -62,3 +68,29 @@ def test_an_evaluation_compiles_few_programs() -> None:
     finally:
         jax.monitoring.unregister_event_duration_listener(note)
     assert 4 <= len(compiled) <= MOST_PROGRAMS, compiled
+
+
+@pytest.mark.parametrize("case", ["fresh", "edited", "off"])
+def test_programs_are_stored_only_where_the_source_is_what_runs(
+    case: str, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    root = tmp_path / "package"
+    root.mkdir()
+    source = root / "__init__.py"
+    source.write_text("")
+    monkeypatch.setattr(sqn_jax, "__file__", str(source))
+    monkeypatch.setattr(sqn_jax, "_IMPORTED", source.stat().st_mtime + 1)
+    if case == "edited":
+        os.utime(source, (source.stat().st_mtime + 2,) * 2)
+    elif case == "off":
+        monkeypatch.setenv("SQN_JAX_CACHE", "off")
+    with cached_work():
+        assert bool(exported._caches) == (case == "fresh")
+    assert not exported._caches
+
+
+def test_every_library_that_a_command_imports_is_declared() -> None:
+    """`jax.export` imports flatbuffers, which JAX does not require."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    assert any(text.startswith("flatbuffers") for text in declared)
+    assert "flatbuffers" in (ROOT / "constraints.txt").read_text()

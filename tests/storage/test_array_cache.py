@@ -164,7 +164,7 @@ def test_other_code_is_something_else(tmp_path: Path) -> None:
 def test_a_package_is_another_with_any_file_name_or_library(tmp_path: Path) -> None:
     package, library = ModuleType("package"), ModuleType("library")
     package.__file__ = str(tmp_path / "__init__.py")
-    library.__version__ = "1.0"  # type: ignore[attr-defined]
+    package.__version__ = library.__version__ = "1.0"  # type: ignore[attr-defined]
     (tmp_path / "inner").mkdir()
     digests = []
 
@@ -180,6 +180,8 @@ def test_a_package_is_another_with_any_file_name_or_library(tmp_path: Path) -> N
     (tmp_path / "inner" / "b.py").rename(tmp_path / "b.py")
     note()
     library.__version__ = "1.1"  # type: ignore[attr-defined]
+    note()
+    package.__version__ = "1.1"  # type: ignore[attr-defined]
     note()
     assert len(set(digests)) == len(digests)
     (tmp_path / "inner" / "notes.txt").write_text("no code")

@@ -377,7 +377,8 @@ def test_a_second_training_reads_what_the_first_compiled(room: Path, tmp_path: P
         path.write_bytes(path.read_bytes()[:-1])
     second, out, err = train_one_chunk(room, tmp_path / "second", tmp_path / "caches")
     assert "\ncompiled earlier, read in" in out
-    assert f"compiled programs in {kept}: {len(others)} damaged" in err
+    programs = [path for path in others if not path.name.startswith("arrays-")]
+    assert f"compiled programs in {kept}: {len(programs)} damaged" in err
     assert err.count("compiled programs") == 1
     assert "Traceback" not in err
     assert "warning" not in err.lower()

@@ -92,7 +92,7 @@ def test_every_difference_that_a_program_depends_on_has_a_program_of_its_own() -
 
 
 def test_weak_types_keep_their_meaning() -> None:
-    """1.5 in Python times an int8 is bfloat16 or float32, depending on whose number it is."""
+    """1.5 times a float16 is float16 or float32, depending on whose number 1.5 is."""
     cache, number = Cache(), exported_jit(lambda x, y: x * y)
     small = jnp.ones(2, jnp.float16)
     with exports_in(cache):
@@ -120,12 +120,41 @@ def test_without_a_cache_or_under_a_trace_it_is_jit() -> None:
     assert not cache.files
 
 
-def test_results_with_static_fields_and_unknown_classes_are_refused() -> None:
-    with exports_in(Cache()), pytest.raises(Exception, match=r"serialization|registered"):
-        exported_jit(lambda x: Pair(x, x))(1.0)  # A class from outside is not imported.
-    env_params = make_env("maze")
-    with exports_in(Cache()), pytest.raises(ValueError, match="static fields"):
-        exported_jit(lambda x: x)(env_params)
+def test_what_cannot_be_exported_is_traced_and_a_line_says_why(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    cache, env_params = Cache(), make_env("maze")
+    with exports_in(cache):
+        pair = exported_jit(lambda x: Pair(x, 2 * x))(1.0)  # A class from outside is not imported.
+        same = exported_jit(lambda x: x)(env_params)
+    assert not cache.files
+    assert (pair.first, pair.second) == (1, 2)
+    assert same.config == env_params.config
+    for line, word in zip(capsys.readouterr().err.splitlines(), ("Pair", "static"), strict=True):
+        assert "traced anew" in line
+        assert word in line
+
+
+@pytest.mark.parametrize("damage", ["no module", "no names", "nobody's class", "short", "zeros"])
+def test_a_file_that_holds_something_else_is_a_line(
+    damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache = Cache()
+    with exports_in(cache):
+        expected = twin()(jnp.ones(3), 2)
+        (arrays,) = cache.files.values()
+        if damage == "no module":
+            del arrays["module"]
+        elif damage == "short":
+            arrays["module"] = arrays["module"][:30]
+        elif damage == "zeros":
+            arrays["module"] = np.zeros(1000, np.uint8)
+        else:
+            names = b"junk" if damage == "no names" else b'["sqn_jax.nowhere:Class"]'
+            arrays["nodes"] = np.frombuffer(names, np.uint8)
+        found = twin()(jnp.ones(3), 2)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert "traced anew" in capsys.readouterr().err
 
 
 def test_settings_of_the_world_are_part_of_the_key() -> None:
