@@ -20,7 +20,8 @@ TASKS: dict[str, Literal["evaluation points", "random pairs"]] = {
 
 CACHE = (
     "Programs, tables of maps and plans of the oracle are stored in the user's cache folder for "
-    "the next start. The environment variable SQN_JAX_CACHE=DIR selects another folder; SQN_JAX_CACHE=off stores none."
+    "the next start. The environment variable SQN_JAX_CACHE=DIR selects another folder; "
+    "SQN_JAX_CACHE=off stores none."
 )
 
 
