@@ -55,8 +55,8 @@ def test_the_tables_of_a_map_are_made_once_for_all_its_kinds_of_tasks(
 ) -> None:
     prepare._table.cache_clear()
     made = []
-    far_sides = prepare.far_sides
-    monkeypatch.setattr(prepare, "far_sides", lambda x: made.append(x.shape) or far_sides(x))
+    far_sides = free_space.far_sides
+    monkeypatch.setattr(free_space, "far_sides", lambda x: made.append(x.shape) or far_sides(x))
     turned = wrap_map(open_map(rows=60, columns=40), [(1.0, 1.0), (1.0, 2.0)], max_steps=33)
     for occupancy_map in (small_map(), turned):
         make_env(occupancy_map, spawn="training")
