@@ -13,7 +13,7 @@ import pytest
 from grid_oracle import open_map, wrap_map
 
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import make_env, prepare
+from sqn_jax.env import free_space, make_env, prepare
 from sqn_jax.env.dynamics import move
 from sqn_jax.maps import OccupancyMap, save_map
 from sqn_jax.maps.occupancy import close_border
