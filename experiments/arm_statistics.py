@@ -117,9 +117,11 @@ def _is_one_of(value: Any, wanted: Any) -> bool:
     return value in wanted if isinstance(wanted, tuple) else value == wanted
 
 
-def _groups(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
-    """Maps that are judged together: procedural ones of a kind, and each of the others."""
-    groups: dict[str, tuple[str, ...]] = {}
+def _groups(
+    rows: Sequence[Mapping[str, Any]], primary: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Maps that are judged together: the primary ones, procedural ones of a kind, others alone."""
+    groups = {"maps that decide": tuple(primary)} if len(primary) > 1 else {}
     for name in dict.fromkeys(row["map"] for row in rows):
         kind, _, number = name.partition(":")
         group = f"{kind}s unseen" if number else name
@@ -127,23 +129,27 @@ def _groups(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def arm_results(scores: Scores, *, reference: str) -> list[dict[str, Any]]:
+def arm_results(
+    scores: Scores, *, reference: str, primary: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     """Each arm on each group of maps: both metrics over training seeds, and beside the reference.
 
     Args:
         scores: of all arms, evaluated alike.
         reference: the arm that the others are compared with.
+        primary: the maps that decide; several of them are also judged together.
 
     Returns:
         An entry for each group of maps, tasks, epsilon and arm: `spl` and `success`, `mean` and
         `ci95` of the seeds' means, `seeds`; of the others `difference`, `p_value`, and `p_holm`
-        adjusted for the number of arms. First come the random pairs on the first map.
+        adjusted for the number of arms. First come the random pairs on the maps that decide, or on
+        the first map.
     """
     rows = next(iter(scores.values()))
     tasks = sorted({row["tasks"] for row in rows}, reverse=True)  # Random pairs first.
     epsilons = sorted({row["epsilon"] for row in rows})
     results: list[dict[str, Any]] = []
-    for group, maps in _groups(rows).items():
+    for group, maps in _groups(rows, primary).items():
         for kind in tasks:
             for epsilon in epsilons:
                 selected = {"map": maps, "tasks": kind, "epsilon": epsilon}

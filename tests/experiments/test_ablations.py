@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 from scipy import stats
 
 from experiments import ablations
-from experiments.ablations import ARENAS, ARMS, decision, parse_changes, planned_runs, with_settings
+from experiments.ablations import decision
+from experiments.arenas import ARENAS, ARMS, parse_changes, planned_runs, with_settings
 from experiments.arm_statistics import (
     arm_results,
     arms_table,
@@ -20,6 +22,7 @@ from experiments.arm_statistics import (
     seed_interval,
     verdict,
 )
+from experiments.common import RESULTS
 from experiments.power import paired_differences, power, runs_on_record
 from sqn_jax import figures
 from sqn_jax.config import TrainConfig
@@ -80,9 +83,11 @@ def test_no_run_is_begun_that_the_budget_has_no_room_for(
 
     monkeypatch.setattr(ablations, "train_unless_done", train)
     monkeypatch.setattr(ablations, "scores_of", lambda *arguments: [])
+    monkeypatch.setattr(ablations, "curve_of", lambda folder: [])
     runs = planned_runs(ARENAS["smoke"])
     # Two runs take 500 s of 720; for a third there is no room, unless it is there already.
-    done = [run.name for run, *_ in ablations.train_within(runs, ARENAS["smoke"], tmp_path, 12)]
+    results = ablations.train_within(runs, ARENAS["smoke"], tmp_path, 12)
+    done = [result.run.name for result in results]
     assert done == ["sqn_seed10", "r2d2_seed10"]
     assert "not trained: equal_seed10, sqn_seed11, r2d2_seed11" in capsys.readouterr().out
 
@@ -182,6 +187,93 @@ def test_arms_are_compared_on_their_common_seeds_map_by_map() -> None:
     assert [text.get_text() for text in panel.get_yticklabels()] == ["dqn (1)", "r2d2 (2)"]
     drawn = [line.get_xdata()[0] for line in panel.lines if line.get_marker() == "o"]
     np.testing.assert_allclose(drawn, [-0.2, -0.05], atol=1e-9)
+
+
+def test_maps_that_decide_are_also_judged_together() -> None:
+    scores = {
+        "sqn": rows({10: 0.7, 11: 0.5}, "maze:100") + rows({10: 0.1, 11: 0.3}, "cave:100"),
+        "equal": rows({10: 0.6, 11: 0.5}, "maze:100") + rows({10: 0.4, 11: 0.3}, "cave:100"),
+    }
+    first, second, *others = arm_results(scores, reference="sqn", primary=("maze:100", "cave:100"))
+    assert [entry["maps"] for entry in (first, second)] == ["maps that decide"] * 2
+    assert first["spl"]["mean"] == pytest.approx(0.4)
+    # Seed 10 has 0.5 and 0.4 on both maps, seed 11 has 0.4 with both arms.
+    assert second["difference"] == pytest.approx(0.05)
+    assert [entry["maps"] for entry in others] == ["mazes unseen"] * 2 + ["caves unseen"] * 2
+    alone = arm_results(scores, reference="sqn", primary=("maze:100",))
+    assert "maps that decide" not in {entry["maps"] for entry in alone}
+
+
+def smoke_results(arm: str, spl: dict[int, float]) -> list[ablations.Result]:
+    return [
+        ablations.Result(
+            run,
+            [
+                row
+                for tasks in ("evaluation points", "random pairs")
+                for row in rows({run.config.seed: spl[run.config.seed]}, tasks=tasks)
+            ],
+            [{"episodes": 64, "mean_reward": 0.1, "success": 0.2}],
+        )
+        for run in planned_runs(ARENAS["smoke"], [arm], list(spl))
+    ]
+
+
+def test_runs_on_record_are_taken_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = smoke_results("sqn", {10: 0.6, 11: 0.7}) + smoke_results("r2d2", {10: 0.5, 11: 0.4})
+    ablations.write_results("smoke", recorded, tmp_path)
+    record, out = tmp_path / "ablations.json", tmp_path / "out"
+    planned = planned_runs(ARENAS["smoke"])
+    found = ablations.earlier_results(record, "smoke", planned)
+    assert found == {result.run.name: result for result in recorded}
+
+    # Only the third arm is trained, and it is compared with those of the record.
+    made = {result.run.name: result for result in smoke_results("equal", {10: 0.1, 11: 0.3})}
+    monkeypatch.setattr(
+        ablations, "train_within", lambda runs, *rest: iter([made.pop(run.name) for run in runs])
+    )
+    arguments = ["ablations", "--arena", "smoke", "--earlier", str(record), "--out", str(out)]
+    monkeypatch.setattr("sys.argv", arguments)
+    ablations.main()
+    assert not made
+    page = " ".join(capsys.readouterr().out.split())
+    assert "| equal | 2 | 0.200 " in page
+    assert "| -0.450 [-1.085, +0.185] |" in page  # 0.5 and 0.4: 0.45, and 12.706 x 0.05.
+    assert "sqn minus r2d2, 2 seeds of both: SPL +0.200 " in page
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "fault"),
+    [
+        (("arena",), "quick", "expected an ablations.json of the arena smoke"),
+        (("scores",), None, "not a whole ablations.json"),
+        (("scores", "sqn"), [], "sqn_seed10 has scores of other maps or tasks"),
+        (("settings", "sqn_seed10", "seed"), 7, "sqn_seed10 has other settings than it has"),
+        (("settings", "sqn_seed10", "num_robots"), 7, "num_robots is 7, expected one of"),
+    ],
+)
+def test_records_of_something_else_are_refused(
+    tmp_path: Path, place: tuple[str, ...], value: Any, fault: str
+) -> None:
+    ablations.write_results("smoke", smoke_results("sqn", {10: 0.6}), tmp_path)
+    path = tmp_path / "ablations.json"
+    record = json.loads(path.read_text())
+    inner = record
+    for name in place[:-1]:
+        inner = inner[name]
+    inner[place[-1]] = value
+    path.write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=fault):
+        ablations.earlier_results(path, "smoke", planned_runs(ARENAS["smoke"]))
+
+
+def test_the_records_of_the_project_can_be_added_to() -> None:
+    for name in ("quick", "caves"):
+        planned = planned_runs(ARENAS[name], ["sqn", "r2d2"])
+        found = ablations.earlier_results(RESULTS / f"ensemble_{name}.json", name, planned)
+        assert list(found) == [run.name for run in planned]
 
 
 def test_the_power_is_that_of_tables_and_of_simulated_seeds() -> None:
