@@ -38,7 +38,7 @@ def test_the_curves_are_the_rows():
     success = panel(figure, "Success")
     np.testing.assert_allclose(curve(success, "success").get_ydata(), [0.1, 0.2, 0.3, 0.4, 0.5])
     np.testing.assert_allclose(
-        curve(success, "epsilon (random actions)").get_ydata(), [0.46, 0.42, 0.38, 0.34, 0.30]
+        curve(success, "epsilon").get_ydata(), [0.46, 0.42, 0.38, 0.34, 0.30]
     )
     skills = panel(figure, "Skill")
     np.testing.assert_allclose(curve(skills, "skill 1").get_ydata(), [0.1, 0.2, 0.3, 0.4, 0.5])
