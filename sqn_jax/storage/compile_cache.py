@@ -12,6 +12,7 @@ import re
 import shutil
 import stat
 import sys
+import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -41,6 +42,14 @@ ARRAYS = "arrays-"
 
 ENTRY = "-cache"
 """How JAX's files end; a checksum lies beside each."""
+
+SEAL = "-sha256"
+"""How the names of the checksums end."""
+
+_SEAL_NAME = re.compile(rf"-[0-9a-f]{{64}}{SEAL}$")
+
+LEFTOVER_AGE = 3600.0
+"""After how many seconds an unfinished file was left by a process that was killed."""
 
 _TROUBLE = re.compile(
     r"Error (reading|writing) persistent compilation cache entry for '([^']*)': (.*)", re.DOTALL
@@ -147,7 +156,9 @@ def _danger(folder: Path) -> str | None:
 
 
 def _tidy(folder: Path) -> None:
-    """Delete programs that are not what was written, and the oldest beyond `LARGEST_BYTES`.
+    """Delete programs that are not what was written, what killed processes left, and the oldest.
+
+    The oldest are those beyond `LARGEST_BYTES`.
 
     JAX runs what it reads. Where it compresses by Zstandard (from Python 3.14 on, or where that
     package is installed), which keeps no checksum, one wrong bit in seven crashes the process or
@@ -168,8 +179,22 @@ def _tidy(folder: Path) -> None:
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
                 path.unlink(missing_ok=True)
+    for path in _leftovers(folder):
+        path.unlink(missing_ok=True)
     if damaged:
         say(f"compiled programs in {folder}: {damaged} damaged, to be compiled again", error=True)
+
+
+def _leftovers(folder: Path) -> Iterator[Path]:
+    """Unfinished files of arrays, and checksums without an entry, of processes that were killed."""
+    for path in folder.iterdir():
+        entry = path.with_name(path.name.removesuffix(SEAL) + ENTRY)
+        is_orphan = _SEAL_NAME.search(path.name) and not os.path.lexists(entry)
+        is_unfinished = path.name.startswith(f".{ARRAYS}") and ".partial" in path.name
+        if is_orphan or is_unfinished:
+            with suppress(FileNotFoundError):  # Another command deletes it, or is writing it.
+                if path.lstat().st_mtime < time.time() - LEFTOVER_AGE:
+                    yield path
 
 
 @contextmanager
@@ -200,7 +225,7 @@ def _sealed(folder: Path) -> Iterator[None]:
 
 def seal_of(entry: Path) -> Path:
     """The file with the checksum of an entry."""
-    return entry.with_name(entry.name.removesuffix(ENTRY) + "-sha256")
+    return entry.with_name(entry.name.removesuffix(ENTRY) + SEAL)
 
 
 def _is_sound(entry: Path, seal: Path) -> bool:

@@ -186,3 +186,41 @@ def test_a_package_is_another_with_any_file_name_or_library(tmp_path: Path) -> N
     assert len(set(digests)) == len(digests)
     (tmp_path / "inner" / "notes.txt").write_text("no code")
     assert code_of_package(package, library) == digests[-1]
+
+
+def test_what_killed_commands_left_is_deleted_after_an_hour(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[Path] = []
+
+    def killed(partial: Path, target: Path) -> None:
+        left.append(partial.rename(partial.with_name(f"{partial.name}.left")))
+        raise KeyboardInterrupt
+
+    with cached_programs():
+        cached_arrays("plans", [b"x"], Maker())
+    (whole,) = folder.glob("*-cache")
+    others = [folder / name for name in (".film.partial.mp4", "notes-sha256")]
+    for path in others:
+        path.write_text("somebody's own")
+    with monkeypatch.context() as patched, cached_programs():
+        # Killed while the second of its two files is written.
+        replace = Path.replace
+        patched.setattr(
+            Path,
+            "replace",
+            lambda self, target: (killed if str(target).endswith("-cache") else replace)(
+                self, target
+            ),
+        )
+        with pytest.raises(KeyboardInterrupt):
+            cached_arrays("plans", [b"y"], Maker())
+    seals = set(folder.glob("*-sha256")) - {compile_cache.seal_of(whole), *others}
+    left += seals
+    assert len(left) == 2
+    with cached_programs():
+        assert all(path.exists() for path in left)
+    for path in (*folder.iterdir(),):
+        os.utime(path, (1e9, 1e9))
+    with cached_programs():
+        assert sorted(folder.iterdir()) == sorted([whole, compile_cache.seal_of(whole), *others])
