@@ -252,7 +252,7 @@ def test_a_wide_robot_shows_its_policy_thicker_obstacles_and_stops_sooner() -> N
 def test_limits_are_checked() -> None:
     for name, value in (
         *(("slowdown", 0.0), ("max_speed", math.inf), ("unseen", math.nan)),
-        *(("robot_radius", -0.1), ("bumper", math.nan)),
+        *(("robot_radius", -0.1), ("bumper", math.nan), ("max_speed", "fast"), ("bumper", True)),
     ):
         with pytest.raises(ValueError, match=f"{name} is"):
             Limits(**{name: value})

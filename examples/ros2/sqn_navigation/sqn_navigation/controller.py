@@ -6,6 +6,7 @@ returns a stop with the reason whenever anything that the policy needs is missin
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.util
 import math
@@ -53,23 +54,14 @@ class Limits:
     """m from the body; a move that would bring what the scan shows nearer is not made. 0: none."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "max_speed",
-            "max_turn_rate",
-            "slowdown",
-            "goal_radius",
-            "stale_after",
-            "time_limit",
-        ):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
+        for name, value in dataclasses.asdict(self).items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"{name} is {value!r}, expected a number")
+            if name in ("unseen", "robot_radius", "bumper"):
+                if not value >= 0 or (math.isinf(value) and name != "unseen"):
+                    raise ValueError(f"{name} is {value}, expected 0 or more m")
+            elif not 0 < value < math.inf:
                 raise ValueError(f"{name} is {value}, expected a positive number")
-        if not self.unseen >= 0:
-            raise ValueError(f"unseen is {self.unseen}, expected 0 or more m")
-        for name in ("robot_radius", "bumper"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, expected 0 or more m")
 
 
 @dataclass(frozen=True)
