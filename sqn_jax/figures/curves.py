@@ -142,7 +142,7 @@ def _draw_loss(axes: Axes, episodes: Floats, loss: Floats) -> None:
 
 
 def _scale_by_factors(axes: Axes, values: Floats) -> None:
-    """A logarithmic scale for values > 0, labelled in plain numbers."""
+    """A logarithmic scale for values > 0, labeled in plain numbers."""
     axes.set_yscale("log")
     factor = values.max() / values.min()
     steps = range(1, 10) if factor < 4 else (1, 2, 5) if factor < 100 else (1,)
