@@ -46,6 +46,7 @@ def paired_differences(entries: Sequence[Mapping[str, Any]], *, title: str) -> F
         axes.set_ylim(-0.6, len(shown) - 0.4)
         axes.axvline(0, color="0.45", lw=1)
         axes.set_title(plain(f"{maps}, {tasks}"), fontsize=11)
+        axes.locator_params(axis="x", nbins=5)
         axes.set_xlabel("difference in SPL", fontsize=9)
         tidy(axes)
     for axes in all_axes[len(panels) :]:
