@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import (
+    EngFormatter,
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+)
 from numpy.typing import NDArray
 
 from sqn_jax.evaluation.statistics import bootstrap_interval
@@ -20,6 +27,8 @@ Floats = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
 
 _TICK_GAP = 0.12  # of the axis between two labels of minutes
+_MULTIPLES = ((10, (1, 2, 3, 5)), (100, (1, 2, 5)))
+"""Up to which factor a logarithmic scale has which multiples of powers of ten."""
 
 
 def _metric(rows: Rows, name: str) -> Floats:
@@ -145,10 +154,14 @@ def _scale_by_factors(axes: Axes, values: Floats) -> None:
     """A logarithmic scale for values > 0, labeled in plain numbers."""
     axes.set_yscale("log")
     factor = values.max() / values.min()
-    steps = range(1, 10) if factor < 4 else (1, 2, 5) if factor < 100 else (1,)
-    axes.yaxis.set_major_locator(LogLocator(subs=steps))
+    if factor < 4:
+        axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axes.yaxis.set_minor_locator(NullLocator())
+    else:
+        multiples = next((multiples for most, multiples in _MULTIPLES if factor < most), (1,))
+        axes.yaxis.set_major_locator(LogLocator(subs=multiples))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_skills(axes: Axes, episodes: Floats, usage: Floats, entropy: Floats) -> None:

@@ -119,6 +119,22 @@ def test_a_run_that_has_not_learned_yet_can_be_drawn():
     assert [text.get_text() for text in axes.texts] == ["no update yet"]
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.01, 1.4, 2.0, 3.9, 5.0, 9.9, 20.0, 99.0, 1e3, 1e6])
+@pytest.mark.parametrize("least", [1e-4, 0.0217, 0.07, 0.95])
+def test_a_loss_can_be_read_off_in_plain_numbers(least, factor):
+    rows = [row(1, loss=least * factor), row(2, loss=least)]
+    axes = panel(drawn(figures.learning_curve(rows, title="a run")), "Loss")
+    low, high = axes.get_ylim()
+    labels = [
+        label.get_text()
+        for label, place in zip(axes.get_yticklabels(), axes.get_yticks(), strict=True)
+        if low <= place <= high and label.get_text()
+    ]
+    assert 2 <= len(labels) <= 12
+    for label in labels:
+        assert low <= float(label.replace("\N{MINUS SIGN}", "-")) <= high
+
+
 def test_a_loss_that_is_not_positive_has_a_linear_scale():
     rows = [row(1, loss=0.5), row(2, loss=0.0)]
     assert panel(figures.learning_curve(rows, title="a run"), "Loss").get_yscale() == "linear"
