@@ -81,7 +81,7 @@ def learning_curve(rows: Rows, *, title: str, paper_reward: float | None = None)
     height = 6.4 if skills > 1 else 3.7
     figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
-    # By hand: a layout engine draws every text once more to measure it, a third of the whole time.
+    # By hand: a layout engine draws every text once more to measure it.
     figure.subplots_adjust(
         **{"left": 0.065, "right": 0.985, "wspace": 0.16 if columns == 2 else 0.24},
         **{"bottom": 0.55 / height, "top": 1 - 1.08 / height, "hspace": 0.3},
