@@ -75,7 +75,7 @@ LONGEST_FILES = (
     "test_oracle.py",
     "test_compile_cache.py",
     "test_compare.py",
-    "test_checkpoint.py",
+    "test_checkpoint_damage.py",
     "test_rollout.py",
     "test_benchmark.py",
 )

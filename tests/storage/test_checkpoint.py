@@ -1,4 +1,4 @@
-"""Checkpoints: what comes back, what is kept, and what damage to any of their files does."""
+"""Checkpoints: what comes back, which stay, and those of other runs."""
 
 from __future__ import annotations
 
@@ -6,102 +6,22 @@ import dataclasses
 import json
 import shutil
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import compiling_quickly
-from rooms import small_room
+from saved_runs import assert_same, config_for, opened, without_replay
 
-from sqn_jax.config import NetworkConfig, ReplayConfig, TrainConfig
-from sqn_jax.config.presets import PRESETS
+from sqn_jax.config import NetworkConfig
 from sqn_jax.env import EnvParams
 from sqn_jax.maps import load_map
 from sqn_jax.storage import manifest
-from sqn_jax.storage.checkpoint import Checkpoints, NotSaved
-from sqn_jax.storage.manifest import Mismatch, Origin
+from sqn_jax.storage.checkpoint import NotSaved
+from sqn_jax.storage.manifest import Mismatch
 from sqn_jax.training import loop
 from sqn_jax.training.state import RunnerState, params_shapes
-
-LENGTH = 6
-
-
-def config_for(method: Any = "r2d2", **changes: Any) -> TrainConfig:
-    return dataclasses.replace(
-        PRESETS["smoke"],
-        method=method,
-        task_sampling="learnability",
-        num_envs=4,
-        total_episodes=16,
-        network=NetworkConfig(hidden_size=8, layer_norm=True),
-        replay=ReplayConfig(capacity=8, min_episodes=8),
-        learner=dataclasses.replace(PRESETS["smoke"].learner, batch_size=4, window_length=LENGTH),
-        **changes,
-    )
-
-
-@pytest.fixture(scope="module")
-def world() -> EnvParams:
-    return small_room(LENGTH)
-
-
-@pytest.fixture(scope="module")
-def states(world: EnvParams) -> list[RunnerState]:
-    """Three states of one run in which every number differs from one to the next."""
-    with compiling_quickly():
-        start = loop.start_run(loop.make_program(world, config_for()))
-
-    def moved(by: int) -> RunnerState:
-        def shift(x: Any) -> Any:
-            if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-                return jax.random.key(by)
-            return ~x if x.dtype == bool and by % 2 else x + jnp.asarray(by, x.dtype)
-
-        return jax.tree.map(shift, start)
-
-    return [moved(by) for by in range(3)]
-
-
-@pytest.fixture(scope="module")
-def shapes(world: EnvParams) -> RunnerState:
-    return loop.runner_shapes(loop.make_program(world, config_for()))
-
-
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory, states: list[RunnerState]) -> Path:
-    """A run folder with checkpoints after chunks 1 and 2; to be copied, not changed."""
-    path = tmp_path_factory.mktemp("saved")
-    with opened(path) as checkpoints:
-        for chunk in (1, 2):
-            checkpoints.save(chunk, states[chunk], score=0.5)
-    return path
-
-
-def opened(path: Path, config: TrainConfig | None = None, **known: Any) -> Checkpoints:
-    return Checkpoints(path, Origin(config or config_for(), **known))
-
-
-@pytest.fixture
-def folder(saved: Path, tmp_path: Path) -> Path:
-    """A copy to do damage to."""
-    shutil.copytree(saved, tmp_path / "run")
-    return tmp_path / "run"
-
-
-def without_replay(runner: RunnerState) -> RunnerState:
-    return dataclasses.replace(runner, learner=dataclasses.replace(runner.learner, memory=None))
-
-
-def assert_same(one: Any, other: Any) -> None:
-    for ours, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        if jax.dtypes.issubdtype(ours.dtype, jax.dtypes.prng_key):
-            ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_what_was_saved_comes_back_bit_for_bit(
@@ -119,175 +39,6 @@ def test_what_was_saved_comes_back_bit_for_bit(
         with opened(saved) as checkpoints:
             params = checkpoints.restore_policy(params_shapes(config_for()), averaged=averaged)
         assert_same(params, expected)
-
-
-# Damage.
-
-
-def flip(file: Path, rng: np.random.Generator) -> None:
-    data = bytearray(file.read_bytes())
-    at = rng.integers(8 * len(data))
-    data[at // 8] ^= 1 << at % 8
-    file.write_bytes(bytes(data))
-
-
-def cut(file: Path, rng: np.random.Generator) -> None:
-    data = file.read_bytes()
-    file.write_bytes(data[: rng.integers(len(data))])
-
-
-def delete(file: Path, _: np.random.Generator) -> None:
-    file.unlink()
-
-
-def grow(file: Path, _: np.random.Generator) -> None:
-    file.write_bytes(file.read_bytes() + b"\0")
-
-
-def files_of(step: Path) -> list[Path]:
-    return sorted(path.relative_to(step) for path in step.rglob("*") if path.is_file())
-
-
-DAMAGE = [flip, *(pytest.param(damage, marks=pytest.mark.long) for damage in (cut, delete, grow))]
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_any_damaged_file_is_named_and_the_older_checkpoint_taken(
-    damage: Callable[[Path, np.random.Generator], None],
-    folder: Path,
-    states: list[RunnerState],
-    shapes: RunnerState,
-) -> None:
-    """Every file of the newest checkpoint, one at a time."""
-    step, aside = folder / "checkpoints" / "2", folder / "checkpoints" / "2.damaged"
-    rng = np.random.default_rng(7)
-    names = files_of(step)
-    assert len(names) > 30
-    for name in names:
-        whole = (step / name).read_bytes()
-        damage(step / name, rng)
-        with (
-            opened(folder) as checkpoints,
-            pytest.warns(UserWarning, match="going on from chunk 1") as warned,
-        ):
-            found, _ = checkpoints.restore(shapes)
-        assert len(warned) == 1
-        assert name.as_posix() in str(warned[0].message)
-        assert str(step) in str(warned[0].message)
-        assert_same(found, states[1])
-        assert not step.exists()
-        aside.rename(step)
-        (step / name).write_bytes(whole)
-    with opened(folder) as checkpoints:  # All is whole again.
-        assert_same(checkpoints.restore(shapes)[0], states[2])
-
-
-@pytest.mark.parametrize("damage", [pytest.param(flip, marks=pytest.mark.long), delete])
-def test_a_policy_is_read_from_sound_files_or_not_at_all(
-    damage: Callable[[Path, np.random.Generator], None], folder: Path, states: list[RunnerState]
-) -> None:
-    step = folder / "checkpoints" / "2"
-    rng, refused = np.random.default_rng(8), 0
-    for name in files_of(step):
-        whole = (step / name).read_bytes()
-        damage(step / name, rng)
-        params, fault = None, ""
-        try:
-            with opened(folder) as checkpoints:
-                params = checkpoints.restore_policy(params_shapes(config_for()), averaged=False)
-        except ValueError as error:
-            fault = str(error)
-        if params is None:
-            assert f"{name.as_posix()} is" in fault
-            assert "\n" not in fault
-            assert "that of chunk 1 is sound" in fault
-            refused += 1
-        else:  # A file of the replay, say.
-            assert name.parts[0] in ("target_params", "memory", "rest")
-            assert_same(params, states[2].learner.params)
-        (step / name).write_bytes(whole)
-    assert refused > 10
-    assert step.is_dir()  # Who only reads moves nothing.
-
-
-def test_every_bit_of_a_manifest_counts(folder: Path) -> None:
-    """500 flips at random: none goes unnoticed."""
-    step = folder / "checkpoints" / "2"
-    whole, rng = (step / "manifest.json").read_bytes(), np.random.default_rng(9)
-    manifest.read(step, 2)
-    for _ in range(500):
-        flip(step / "manifest.json", rng)
-        with pytest.raises(manifest.Damaged, match=r"^manifest\.json is not what was written"):
-            manifest.read(step, 2)
-        (step / "manifest.json").write_bytes(whole)
-
-
-def test_files_that_do_not_belong_to_a_checkpoint_are_named(
-    folder: Path, shapes: RunnerState
-) -> None:
-    (folder / "checkpoints" / "2" / "rest" / "more").write_text("x")
-    with opened(folder) as checkpoints, pytest.warns(UserWarning, match="rest/more does not bel"):
-        checkpoints.restore(shapes)
-
-
-def test_checkpoints_that_have_changed_places_are_noticed(
-    folder: Path, shapes: RunnerState
-) -> None:
-    shutil.rmtree(folder / "checkpoints" / "2")
-    (folder / "checkpoints" / "1").rename(folder / "checkpoints" / "2")
-    with opened(folder) as checkpoints, pytest.raises(ValueError, match=r"that of chunk 1$"):
-        checkpoints.restore(shapes)
-
-
-def test_where_none_is_sound_each_is_named_and_stays(folder: Path, shapes: RunnerState) -> None:
-    for chunk in ("1", "2"):
-        (folder / "checkpoints" / chunk / "rest" / "_METADATA").unlink()
-    with opened(folder) as checkpoints, pytest.raises(ValueError, match="damaged") as error:
-        checkpoints.restore(shapes)
-    assert str(error.value).count("rest/_METADATA is missing") == 2
-    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["1", "2"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"contents": {"schema": 1}},
-        {"contents": {"schema": 2}},
-        {"contents": []},
-        {"contents": None},
-        [],
-        {"contents": {"schema": 1, "chunk": 2, "files": {"../../x": ""}, "leaves": {"a": 1}}},
-    ],
-)
-def test_a_manifest_from_elsewhere_ends_in_one_line(
-    content: Any, folder: Path, shapes: RunnerState
-) -> None:
-    """Sealed as it should be, with other contents."""
-    if isinstance(content, dict) and isinstance(content["contents"], dict):
-        content["sha256"] = manifest._contents_digest(content["contents"])
-    (folder / "checkpoints" / "2" / "manifest.json").write_text(json.dumps(content))
-    with opened(folder) as checkpoints, pytest.raises(ValueError, match=r"manifest\.json"):
-        checkpoints.restore_policy(params_shapes(config_for()), averaged=False)
-
-
-def test_numbers_that_change_on_the_way_back_are_noticed(
-    saved: Path, shapes: RunnerState, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By whatever fault of a library: sound files are no proof of sound numbers."""
-    with opened(saved) as checkpoints:
-        restore = checkpoints._orbax.restore
-
-        def altered(*args: Any, **kwargs: Any) -> Any:
-            found = restore(*args, **kwargs)
-            found["rest"]["round"] += 1
-            return found
-
-        monkeypatch.setattr(checkpoints._orbax, "restore", altered)
-        with pytest.raises(ValueError, match="rest/round was restored with other numbers"):
-            checkpoints.restore(shapes)
-
-
-# Other runs.
 
 
 def test_another_network_is_told_in_a_table_and_nothing_is_moved(
@@ -376,9 +127,6 @@ def test_another_map_is_noticed_but_not_where_it_lies(
         ):
             checkpoints.restore(shapes)
         assert "map." in error.value.table
-
-
-# What is kept.
 
 
 def test_the_newest_two_and_the_best_are_kept(
