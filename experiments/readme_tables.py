@@ -74,6 +74,18 @@ def paper() -> str:
     return f"{_over_seeds(evaluation)}\n\n{_comparisons(evaluation)}"
 
 
+def paper_sqn() -> str:
+    """One long run of SQN with the preset `paper`: success and time steps with each epsilon."""
+    columns = [(name, "evaluation points") for name in PAPER_MAPS] + [("maze", "random pairs")]
+    entries = results_of("paper_sqn_table.json") + results_of("paper_sqn_pairs.json")
+    rows = []
+    for agent, label in {"sqn": "SQN, epsilon 0", "sqn, epsilon 0.1": "SQN, epsilon 0.1"}.items():
+        ours = [one_of(entries, agent, name, tasks=tasks) for name, tasks in columns]
+        rows.append([label, *(f"{mean(each)}, {steps(each)}" for each in ours)])
+    rows.append([*_paper_row("sqn"), ""])
+    return markdown_table(["success, time steps", *PAPER_MAPS, "maze, random pairs"], rows)
+
+
 def paper_half() -> str:
     """One seed of each agent halfway through `paper`: success with each epsilon and parameters."""
     columns = [(name, "evaluation points") for name in PAPER_MAPS] + [("maze", "random pairs")]
@@ -197,7 +209,7 @@ def starts() -> str:
 TABLES = {
     each.__name__: each
     for each in (
-        *(agents, policies, quick, seeds, paper, paper_half, dead_ends, noise),
+        *(agents, policies, quick, seeds, paper, paper_sqn, paper_half, dead_ends, noise),
         *(external, fresh, best, card),
         *(sensors, simulator, breakdown, training, learner, starts),
     )
