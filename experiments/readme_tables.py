@@ -127,6 +127,7 @@ def noise() -> str:
         for label, entries, agent in (
             *((f"`pretrained:{agent}`", three, agent) for agent in NAMES),
             ("`pretrained:best`", best, "sqn"),
+            ("SQN of `paper`", results_of("paper_sqn_noise.json"), "sqn"),
         )
     ]
     return markdown_table(header, rows)
