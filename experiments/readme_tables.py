@@ -33,6 +33,7 @@ NAMES = {"sqn": "SQN", "r2d2": "R2D2", "dqn": "DQN"}
 ALIKE = {"sqn sqn": "sqn", "r2d2": "r2d2", "dqn": "dqn"}
 """Three agents trained alike, by their names in `pretrained_table.json`, and their algorithms."""
 BENCHMARK = "benchmark.json"
+PAPER_TASKS = (*((name, "evaluation points") for name in PAPER_MAPS), ("maze", "random pairs"))
 STARTS = ("start_smoke.json", "start_evaluate.json", "start_render.json")
 
 
@@ -76,11 +77,10 @@ def paper() -> str:
 
 def paper_sqn() -> str:
     """One long run of SQN with the preset `paper`: success and time steps with each epsilon."""
-    columns = [(name, "evaluation points") for name in PAPER_MAPS] + [("maze", "random pairs")]
     entries = results_of("paper_sqn_table.json") + results_of("paper_sqn_pairs.json")
     rows = []
     for agent, label in {"sqn": "SQN, epsilon 0", "sqn, epsilon 0.1": "SQN, epsilon 0.1"}.items():
-        ours = [one_of(entries, agent, name, tasks=tasks) for name, tasks in columns]
+        ours = [one_of(entries, agent, name, tasks=tasks) for name, tasks in PAPER_TASKS]
         rows.append([label, *(f"{mean(each)}, {steps(each)}" for each in ours)])
     rows.append([*_paper_row("sqn"), ""])
     return markdown_table(["success, time steps", *PAPER_MAPS, "maze, random pairs"], rows)
@@ -88,7 +88,6 @@ def paper_sqn() -> str:
 
 def paper_half() -> str:
     """One seed of each agent halfway through `paper`: success with each epsilon and parameters."""
-    columns = [(name, "evaluation points") for name in PAPER_MAPS] + [("maze", "random pairs")]
     rows = []
     for algorithm, label in NAMES.items():
         for params in ("latest", "target"):
@@ -97,7 +96,7 @@ def paper_half() -> str:
             names = [algorithm, *(f"{algorithm}, epsilon {epsilon}" for epsilon in (0.05, 0.1))]
             cells = [
                 " / ".join(mean(one_of(entries, agent, name, tasks=tasks)) for agent in names)
-                for name, tasks in columns
+                for name, tasks in PAPER_TASKS
             ]
             rows.append([f"{label}, {params}", *cells])
         results = [f"{PAPER_RESULTS[algorithm][name][0]:.2f}" for name in PAPER_MAPS]
