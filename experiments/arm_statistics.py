@@ -9,10 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sqn_jax.evaluation.scores import markdown_table
-from sqn_jax.evaluation.statistics import paired_comparison
+from sqn_jax.evaluation.statistics import paired_comparison, seed_interval
 
 Scores = dict[str, list[dict[str, Any]]]
 """By arm, rows with `seed`, `map`, `tasks`, `epsilon`, `spl`, `success`, `time_steps`."""
@@ -23,20 +22,6 @@ RELEVANT = 0.02
 LEVEL = 0.05
 FEWEST_SEEDS = 6
 """With fewer pairs no permutation test reaches the level: of five the least p-value is 2 / 32."""
-
-
-def seed_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float] | None:
-    """Student's interval of the mean of values [n] of n training seeds; None for fewer than two.
-
-    A percentile bootstrap of so few values is too narrow: of ten by a fifth.
-    """
-    from scipy import stats
-
-    array = np.asarray(values, np.float64)
-    if array.size < 2:
-        return None
-    half = stats.t.ppf((1 + confidence) / 2, array.size - 1) * stats.sem(array)
-    return float(array.mean() - half), float(array.mean() + half)
 
 
 def paired_by_seed(first: Mapping[int, float], second: Mapping[int, float]) -> dict[str, Any]:

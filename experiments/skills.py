@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from experiments.arm_statistics import seed_interval
 from experiments.common import run
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.settings import Settings
+from sqn_jax.evaluation.statistics import seed_interval
 from sqn_jax.policies.interventions import fix_skill_weights, swap_skills, without_skill
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, of_seed

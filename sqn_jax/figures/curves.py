@@ -19,7 +19,7 @@ from matplotlib.ticker import (
 )
 from numpy.typing import NDArray
 
-from sqn_jax.evaluation.statistics import bootstrap_interval
+from sqn_jax.evaluation.statistics import seed_interval
 from sqn_jax.figures.style import COLORS, DPI, INK, WIDTH_IN, plain, tidy
 from sqn_jax.storage.metrics import evaluated_rows
 
@@ -230,8 +230,8 @@ def learning_curves(
         paper_rewards: by agent, the paper's final mean rewards, drawn beside those of evaluation.
 
     Returns:
-        Two panels. The line is the mean over the training seeds of an agent, the band its 95 %
-        bootstrap interval; with one seed there is no band.
+        Two panels. The line is the mean over the training seeds of an agent, the band Student's
+        95 % interval; with one seed there is no band.
 
     Raises:
         ValueError: no agents, or an agent without rows.
@@ -274,8 +274,9 @@ def _draw_band(
 ) -> None:
     """Draw the mean of values [R, S] over seeds; with several seeds, also its interval."""
     axes.plot(episodes, values.mean(axis=1), color=color, lw=2, label=label)
-    if values.shape[1] > 1:
-        low, high = np.array([bootstrap_interval(row, resamples=400) for row in values]).T
+    intervals = [seed_interval(row) for row in values]
+    if None not in intervals:
+        low, high = np.array(intervals).T
         axes.fill_between(episodes, low, high, color=color, alpha=0.2, lw=0)
 
 

@@ -16,6 +16,7 @@ from sqn_jax.evaluation.statistics import (
     interquartile_mean,
     probability_of_improvement,
     sample_std,
+    seed_interval,
     stratified_bootstrap,
     success_weighted_path_length,
     wilson_interval,
@@ -47,6 +48,22 @@ def test_the_bootstrap_interval_is_near_that_of_scipy() -> None:
     low, high = bootstrap_interval(values)
     assert low == pytest.approx(theirs.low, rel=0.02)
     assert high == pytest.approx(theirs.high, rel=0.02)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.99])
+@pytest.mark.parametrize("seeds", [2, 3, 6, 10, 40])
+def test_the_interval_over_seeds_is_student_s(seeds: int, confidence: float) -> None:
+    values = np.random.default_rng(seeds).normal(0.7, 0.2, seeds)
+    theirs = stats.ttest_1samp(values, 0).confidence_interval(confidence)
+    assert seed_interval(values, confidence) == pytest.approx((theirs.low, theirs.high))
+
+
+def test_equal_seeds_have_an_interval_of_no_width() -> None:
+    assert seed_interval([0.25] * 4) == (0.25, 0.25)
+
+
+def test_one_seed_has_no_interval() -> None:
+    assert seed_interval([0.7]) is None
 
 
 def test_one_value_has_an_interval_of_no_width() -> None:

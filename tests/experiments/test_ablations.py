@@ -19,7 +19,6 @@ from experiments.arm_statistics import (
     arms_table,
     holm,
     paired_by_seed,
-    seed_interval,
     verdict,
 )
 from experiments.common import RESULTS
@@ -104,7 +103,6 @@ def test_intervals_over_seeds_are_student_s_and_the_test_is_exact() -> None:
     # Of the 16 ways of exchanging, those with as large a sum: all as they are, the third turned,
     # and the same with all turned.
     assert found["p_value"] == pytest.approx(4 / 16)
-    assert seed_interval([0.7]) is None
     assert paired_by_seed({1: 0.5}, {2: 0.5})["difference"] is None
 
 

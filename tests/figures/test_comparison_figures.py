@@ -36,9 +36,12 @@ def test_a_line_is_the_mean_over_runs_and_seeds_with_a_band_around_it() -> None:
     np.testing.assert_allclose(dqn.get_ydata(), [4.0, 5.0])
     np.testing.assert_allclose(success.lines[0].get_ydata(), [0.5, 0.5])
     assert len(reward.collections) == 1, "one seed has no band"
-    band = reward.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.min() >= 0
-    assert band.max() <= 5
+    # Student's interval of 0, 2, 4 and of 1, 3, 5: the mean, and 4.303 times 2 / sqrt(3).
+    band = reward.collections[0].get_paths()[0].vertices
+    for episodes, mean in ((100, 2.0), (200, 3.0)):
+        ends = band[band[:, 0] == episodes, 1]
+        assert ends.min() == pytest.approx(mean - 4.303 * 2 / math.sqrt(3), abs=1e-3)
+        assert ends.max() == pytest.approx(mean + 4.303 * 2 / math.sqrt(3), abs=1e-3)
     assert [text.get_text() for text in reward.get_legend().get_texts()] == ["SQN", "DQN"]
     with pytest.raises(ValueError, match="agent SQN: no rows"):
         figures.learning_curves({"SQN": [[]]}, title="nothing")
