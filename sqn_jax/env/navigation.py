@@ -135,7 +135,7 @@ def step(
     velocity = params.commands[action]
     if params.config.velocity_noise > 0:
         velocity = velocity + params.velocity_noise * jax.random.normal(motion_key, (2,))
-    blocked = _bumper_stops(state.pose, velocity, params)
+    blocked = _bumper_stops(reading_key, state.pose, params.commands[action], params)
     pose, collision = move(
         state.pose,
         jnp.where(blocked, 0.0, velocity),
@@ -179,12 +179,7 @@ def observe(key: Array, ranges: Array, state: EnvState, params: EnvParams) -> Ob
     With noise and a `scan_margin` if configured.
     """
     config = params.config
-    if config.range_noise > 0:
-        noise = params.range_noise * jax.random.uniform(key, ranges.shape, minval=-1.0)
-        if config.range_noise_unit == "relative":
-            ranges = ranges * (1 + noise)
-        else:
-            ranges = ranges + config.max_range * noise
+    ranges = _with_noise(key, ranges, params)
     if config.scan_margin > 0:
         ranges = thickened(
             jnp.maximum(ranges, 0.0),
@@ -232,15 +227,29 @@ def covered_along(poses: Array, params: EnvParams) -> Array:
     return covered
 
 
-def _bumper_stops(pose: Array, velocity: Array, params: EnvParams) -> Array:
-    """Whether the bumper, if there is one, keeps the robot from this move."""
+def _with_noise(key: Array, ranges: Array, params: EnvParams) -> Array:
+    config = params.config
+    if config.range_noise == 0:
+        return ranges
+    noise = params.range_noise * jax.random.uniform(key, ranges.shape, minval=-1.0)
+    if config.range_noise_unit == "relative":
+        return ranges * (1 + noise)
+    return ranges + config.max_range * noise
+
+
+def _bumper_stops(key: Array, pose: Array, command: Array, params: EnvParams) -> Array:
+    """Whether the bumper, if there is one, keeps the robot from this move.
+
+    It knows what a robot's would: readings with noise, of a scan of its own, and the command, not
+    the move that comes of it.
+    """
     config = params.config
     if config.bumper == 0:
         return jnp.bool_(False)
     return is_blocked(
-        true_ranges(pose, params),
+        _with_noise(jax.random.fold_in(key, 1), true_ranges(pose, params), params),
         beam_angles(config).astype(np.float32),
-        velocity[0] * params.time_step,
+        command[0] * params.time_step,
         radius=config.robot_radius,
         reach=config.robot_radius + config.bumper,
         max_range=config.max_range,

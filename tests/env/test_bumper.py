@@ -128,6 +128,49 @@ def test_it_stops_before_a_wall_and_lets_the_robot_go_along_and_away() -> None:
     assert moved((0.18, 2.0, 0.0), FORWARD) == (pytest.approx(0.25, abs=1e-5), False, False)
 
 
+def stopped(config: EnvConfig, x: float, action: int, keys: int = 400) -> tuple[np.ndarray, ...]:
+    """Refused and touched [keys] for a robot that faces the wall at 0.05 m, from x m."""
+    occupancy_map = wrap_map(open_map(rows=100, columns=200), [(1.0, 1.0), (9.0, 4.0)])
+    params = make_env(occupancy_map, config)
+    key, goal = jax.random.key(0), jnp.array([9.0, 4.0])
+    _, state = reset_to(key, jnp.array([x, 2.0, np.pi]), goal, params)
+    each = jax.jit(jax.vmap(step, in_axes=(0, None, None, None)))
+    *_, info = each(jax.random.split(key, keys), state, action, params)
+    return np.asarray(info["refused"]), np.asarray(info["collision"])
+
+
+def test_it_sees_the_readings_with_their_noise() -> None:
+    """Of the true scan a move from 0.55 m ends 0.25 m before the wall, and one from 0.4 m at 0.1 m.
+
+    Readings that are 60 % off at most say 0.2 m to 0.8 m and 0.14 m to 0.56 m of the wall ahead.
+    """
+    config = EnvConfig(bumper=0.05, range_noise=0.6)
+    rng, angles = np.random.default_rng(0), BEAMS
+    for x in (0.55, 0.7, 0.4):
+        toward = np.cos(angles)
+        true = np.where(toward > 0, (x - 0.05) / np.where(toward > 0, toward, 1.0), np.inf)
+        # The near wall alone: the others are too far to stop anything.
+        true = np.minimum(true, 5.0)
+        stops = [
+            by_walking(true * (1 + rng.uniform(-0.6, 0.6, 71)), 0.25, 0.1, 0.15, 0.0)
+            for _ in range(200)
+        ]
+        refused, _ = stopped(config, x, FORWARD)
+        assert refused.mean() == pytest.approx(np.mean(stops), abs=0.12), x
+
+
+def test_it_knows_the_command_and_not_the_move_that_comes_of_it() -> None:
+    config = EnvConfig(bumper=0.05, velocity_noise=0.5, velocity_noise_unit="absolute")
+    # A turn is no approach, and may end at the wall all the same.
+    refused, touched = stopped(config, 0.16, LEFT)
+    assert touched.any()
+    np.testing.assert_array_equal(refused, touched)
+    # A move that would end too near is stopped, however short it would become.
+    refused, touched = stopped(config, 0.44, FORWARD)
+    assert refused.all()
+    assert not touched.any()
+
+
 @pytest.mark.parametrize("name", ["maze", "forest"])
 def test_with_it_random_robots_touch_nothing(name: str) -> None:
     params = make_env(load_map(name), EnvConfig(bumper=0.05))
