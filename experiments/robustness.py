@@ -1,6 +1,6 @@
 """The paper's robustness figure: success under velocity noise and range noise.
 
-    .venv/bin/python experiments/robustness.py [--preset quick|paper|smoke] [--num-seeds K]
+    .venv/bin/python experiments/robustness.py [--preset quick|best|paper|smoke] [--num-seeds K]
 
 Uses the runs of table1.py, trains what is missing, and writes robustness.json (with one record an
 episode in robustness.jsonl), robustness.md and robustness.png.

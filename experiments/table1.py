@@ -1,6 +1,6 @@
 """The paper's table: three agents on four maps, beside the paper's numbers and two references.
 
-    .venv/bin/python experiments/table1.py [--preset quick|paper|smoke] [--num-seeds K]
+    .venv/bin/python experiments/table1.py [--preset quick|best|paper|smoke] [--num-seeds K]
 
 Trains what is missing, the K seeds of an agent in one program, evaluates it, and writes table1.json
 (with one record an episode in table1.jsonl), table1.md and learning_curves.png. With smoke the

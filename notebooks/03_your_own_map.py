@@ -108,9 +108,9 @@ for name, gray in (("free", FREE), ("occupied", OCCUPIED), ("unknown", UNKNOWN))
     print(f"{name}: {np.mean(image == gray):.1%} of the cells")
 
 # %% [markdown]
-# Four more keys are our own, and ROS passes over them: `max_steps`, `spawn_points`, `spawn_radius`
-# and `evaluation_points`. Without points sixteen starting places are chosen, far from each other,
-# and the first four of them to evaluate between.
+# Five more keys are our own, and ROS passes over them: `max_steps`, `spawn_points`, `spawn_radius`,
+# `evaluation_points` and `region`. Without points sixteen starting places are chosen, far from
+# each other, and the first four of them to evaluate between.
 #
 # ## Will it do?
 #
@@ -288,7 +288,8 @@ paths_of("as trained" if SMALL else "radius 0.2 m", load_map("maze"), max_panels
 #   0.905 [0.856, 0.938], half the turn rate with it gives 0.865 [0.811, 0.906], readings up to 3 m
 #   0.760 [0.696, 0.814]. What is hard is a larger body: 0.440 [0.373, 0.509] at a radius of 0.2 m,
 #   with 203.5 refused moves an episode, and 0.065 at 0.3 m. The policy has learnt to pass corners
-#   as close as its own radius allowed, and does not see that it is larger now.
+#   as close as its own radius allowed, and does not see that it is larger now. What helps:
+#   `sqn evaluate --robot-radius` shows it thicker obstacles (docs/USAGE.md, another body).
 # - So measure before you trust, with the wall follower beside it; then train on a map of the kind
 #   and with the robot you have. One training seed, 200 tasks a row.
 

@@ -76,7 +76,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             num_envs: N, robots.
             autoreset_mode: what happens after the end of an episode.
             arrays: "numpy": results are arrays of one's own on the host; "jax": they stay on the
-                device, and `infos` has `final_obs` and `final_info` in every step.
+                device, and with SAME_STEP `infos` has `final_obs` and `final_info` in every step.
             render_mode: "rgb_array": `render` returns a picture of each env.
             spawn: tasks near the map's spawn points, or at its evaluation points.
             max_episode_steps: another name of the setting `max_steps`, that of `make_vec`.

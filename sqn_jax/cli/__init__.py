@@ -1,5 +1,5 @@
-"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn export`,
-`sqn map check`, `sqn tasks`.
+"""The command line: `sqn train`, `sqn evaluate`, `sqn render`, `sqn report`, `sqn play`,
+`sqn export`, `sqn map check`, `sqn tasks`.
 
 It only passes arguments to functions.
 

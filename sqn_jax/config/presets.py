@@ -41,7 +41,7 @@ def _quick() -> TrainConfig:
 
 
 def _best() -> TrainConfig:
-    """`quick` with seven times the steps, on generated maps of all kinds and their mirror images.
+    """`quick` with 7.5 times the steps, on generated maps of all kinds and their mirror images.
 
     The Maze, the Column, the Forest and the Cave themselves are not among them. Most tasks come
     from maps on which about every other goal is reached.
@@ -104,6 +104,6 @@ PRESETS: dict[str, TrainConfig] = {
 `paper` has every setting that the paper gives (sections III, IV-A, IV-C and IV-D). What it leaves
 open is chosen here: learning rate, Adam's epsilon and the gradient norm, discount, `n_step`, double
 Q-learning, value rescaling, priorities, size of the replay and when updates begin, robots a round
-and updates an episode, the robot's and the goal's radius. docs/ARCHITECTURE.md says why. On a GPU
-the products of the GRU are float16; ranges in the replay are 8 bits.
+and updates an episode, the robot's and the goal's radius. docs/ARCHITECTURE.md says why. Ranges in
+the replay are 8 bits; on a GPU for data centers the recurrent products of the GRU are float16.
 """

@@ -336,7 +336,7 @@ def run_on_tasks(
         navigator: the baseline.
         env_params: from `env.several_maps.join_maps`.
         tasks: [E] of them.
-        collision_ends: whether a refused move makes a task fail.
+        collision_ends: whether a collision makes a task fail.
     """
     trajectory = navigator(keys, _own_robot(env_params), (), tasks)
     metrics = task_metrics(trajectory, tasks, collision_ends=collision_ends)

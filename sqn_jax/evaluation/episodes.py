@@ -160,7 +160,7 @@ def run_seeds(
         fields: the fields of `Trajectory` to return; all together take about 0.4 kB per step.
         on_batch: called after each batch with its number of episodes, of all policies together.
         tasks: the tasks of the episodes, with radii of their own; None: drawn from the world.
-        collision_ends: whether a refused move makes a given task fail.
+        collision_ends: whether a collision makes a given task fail.
 
     Returns:
         The results of each policy.

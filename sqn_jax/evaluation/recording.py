@@ -116,7 +116,7 @@ class Episode:
 
     @property
     def collisions(self) -> NDArray[np.bool_]:
-        """[T] whether the move was refused."""
+        """[T] whether the move was refused since the body would touch something."""
         collisions: NDArray[np.bool_] = self.trajectory.info["collision"]
         return collisions
 

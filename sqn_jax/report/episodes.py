@@ -62,7 +62,7 @@ class WorstEpisode:
 
     @property
     def collisions(self) -> int:
-        """Number of collisions, moves that were refused, within these steps."""
+        """Moves within these steps that were refused since the body would touch something."""
         return int(self.batch.trajectory.info["collision"][: self.steps, self.episode].sum())
 
     @property

@@ -16,8 +16,6 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
-import jax
-
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -84,5 +82,7 @@ def deferred(waiting_for: str) -> Iterator[list[int]]:
 
 def wait_for(arrays: Any) -> None:
     """Wait until arrays are computed, in short sleeps: Python handles no signals inside JAX."""
+    import jax
+
     while not all(array.is_ready() for array in jax.tree.leaves(arrays)):
         time.sleep(0.005)

@@ -86,7 +86,7 @@ class TaskSuite:
     robot: tuple[tuple[str, float], ...] = ()
     """Settings of `EnvConfig` by name (`ROBOT_FIELDS`) that this suite fixes."""
     collision_ends: bool = False
-    """Whether a refused move ends the episode as a failure."""
+    """Whether a collision ends the episode as a failure; a move that a bumper stopped is none."""
 
     def robot_of(self, env_config: EnvConfig) -> EnvConfig:
         """A robot with what this suite fixes.

@@ -44,7 +44,7 @@ def first_observation(obs: Observation, config: NetworkConfig) -> Observation:
 
 
 def next_observation(
-    seen: Observation, obs: Observation, actions: Array, collisions: Array
+    seen: Observation, obs: Observation, actions: Array, refused: Array
 ) -> Observation:
     """What a network sees after a step, that has seen `seen` before it.
 
@@ -55,22 +55,22 @@ def next_observation(
         seen: what it saw before; it says whether there is `motion`.
         obs: what the env shows now, [..., R] and [..., G].
         actions: [...] int32, taken in the step.
-        collisions: [...] bool, from `navigation.step`; those of other actions than moves, which
+        refused: [...] bool, from `navigation.step`; those of other actions than moves, which
             only velocity noise causes and a robot cannot notice, do not count.
     """
     if not isinstance(seen, MotionObservation):
         return obs
-    return with_motion(obs, jax.nn.one_hot(actions, NUM_ACTIONS), collisions)
+    return with_motion(obs, jax.nn.one_hot(actions, NUM_ACTIONS), refused)
 
 
-def with_motion(obs: HasObservation, last: Array, collisions: Array) -> MotionObservation:
+def with_motion(obs: HasObservation, last: Array, refused: Array) -> MotionObservation:
     """An observation with the step before it.
 
     Args:
         obs: of the env, [..., R] and [..., G].
         last: [..., A] the action of that step, one-hot, or zeros before the first.
-        collisions: [...] bool, whether the robot was kept from moving; only moves count.
+        refused: [...] bool, whether the robot was kept from moving; only moves count.
     """
-    refused = collisions * (last[..., FORWARD] + last[..., BACKWARD])
-    motion = jnp.concatenate([last, refused[..., None]], axis=-1)
+    refused_move = refused * (last[..., FORWARD] + last[..., BACKWARD])
+    motion = jnp.concatenate([last, refused_move[..., None]], axis=-1)
     return MotionObservation(ranges=obs.ranges, goal=obs.goal, motion=motion)

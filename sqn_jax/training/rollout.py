@@ -208,7 +208,7 @@ class EpisodeMetrics:
     mean_reward: Array
     """Mean reward a step."""
     collisions: Array
-    """int32: refused moves."""
+    """int32: moves refused since the body would touch something, not those a bumper stopped."""
     covered_area: Array
     """m2 seen beyond the first scan."""
     path_length: Array
@@ -230,7 +230,7 @@ def episode_metrics(
         trajectory: with `rewards`, `poses` and `info`.
         goal_radius: m, one number or [N].
         max_steps: [N] steps of each episode, at most T; None: T.
-        collision_ends: bool, whether nothing counts after the first refused move; None: no.
+        collision_ends: bool, whether nothing counts after the first collision; None: no.
     """
     info = trajectory.info
     length, num_robots = trajectory.rewards.shape

@@ -28,7 +28,7 @@ MAX_SKILLS = 256
 """Skills of a network: each is a module of its own in the program."""
 
 MAX_PARAMETERS = 2**27
-"""Parameters of all seeds of a run; those of the paper's network are 230,000."""
+"""Parameters of all seeds of a run; those of the paper's SQN are 242,060."""
 
 
 @struct.dataclass

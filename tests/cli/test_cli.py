@@ -31,6 +31,17 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
     return told
 
 
+def test_the_overview_loads_no_jax() -> None:
+    """A second and a half, which every `sqn --help` would wait."""
+    code = (
+        "import sys, sqn_jax.cli; code = sqn_jax.cli.main(['--help']);"
+        "sys.exit(code or 'jax' in sys.modules or 'numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, stdout=subprocess.PIPE)
+    assert done.returncode == 0
+    assert b"sqn train" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "names"),
     [
