@@ -26,6 +26,7 @@ from flax.training.train_state import TrainState
 from jax import Array
 
 from sqn_jax.adapters.gymnax import Navigation
+from sqn_jax.storage.files import probe_file
 
 FOUR_ROOMS = f"{Path(__file__).with_name('four_rooms.map')}@0.25"
 """A map of 6 x 6 m, and its scale in m a cell."""
@@ -214,9 +215,9 @@ def main() -> None:
         if isinstance(value, int) and name != "seed" and value < 1:
             option = name.replace("_", "-")
             parser.exit(2, f"purejaxrl_ppo: --{option} is {value}, expected 1 or more\n")
-    if options.out is not None and not options.out.absolute().parent.is_dir():
-        parser.exit(2, f"purejaxrl_ppo: --out {options.out}: there is no such folder\n")
     try:
+        if options.out is not None:
+            probe_file(options.out)
         train = make_train(options)
     except ValueError as error:
         parser.exit(2, f"purejaxrl_ppo: {error}\n")

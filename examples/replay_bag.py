@@ -103,7 +103,10 @@ def read_events(bag: Path, topics: dict[str, str]) -> Iterator[Event]:
 
 
 def replay(events: Iterator[Event], controller: Controller, mount: Mount) -> list[Row]:
-    """Hand a recording to a controller; it decides at each scan.
+    """Hand a recording to a controller; asked at each scan, it decides as often as on a robot.
+
+    A scan counts as new when it was recorded, and a pose until the next one: old ones are not
+    noticed here, as they are by the node.
 
     Raises:
         ValueError: there is no scan, or a goal is in another frame than the poses.

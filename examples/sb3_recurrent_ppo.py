@@ -26,6 +26,7 @@ except ImportError as missing:
     raise SystemExit(2) from None
 
 from sqn_jax.adapters.sb3 import NavigationVecEnv
+from sqn_jax.storage.files import probe_file
 
 FOUR_ROOMS = f"{Path(__file__).with_name('four_rooms.map')}@0.25"
 """A map of 6 x 6 m, and its scale in m a cell."""
@@ -135,9 +136,11 @@ def main() -> None:
         if isinstance(value, int) and name != "seed" and value < 1:
             option = name.replace("_", "-")
             parser.exit(2, f"sb3_recurrent_ppo: --{option} is {value}, expected 1 or more\n")
-    if options.out is not None and not options.out.absolute().parent.is_dir():
-        parser.exit(2, f"sb3_recurrent_ppo: --out {options.out}: there is no such folder\n")
+    if options.rollout_steps * options.num_envs < 8:
+        parser.exit(2, "sb3_recurrent_ppo: expected 8 or more steps of all envs between updates\n")
     try:
+        if options.out is not None:
+            probe_file(options.out)
         rows = train(options)
     except ValueError as error:
         parser.exit(2, f"sb3_recurrent_ppo: {error}\n")

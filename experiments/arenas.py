@@ -163,8 +163,12 @@ def planned_runs(
         changes: to the settings of all arms.
 
     Raises:
-        ValueError: a setting is unknown or out of its range, or runs would have seeds in common.
+        ValueError: a setting is unknown or out of its range, runs would have seeds in common, or
+            more seeds than the arena says.
     """
+    for name in ("seed", "num_seeds"):
+        if name in (changes or {}):
+            raise ValueError(f"--set {name}: expected --seeds and --num-seeds to say it")
     chosen = list(arena.seeds) if arms is None else list(arms)
     firsts = sorted(seeds or [])
     if any(later - earlier < num_seeds for earlier, later in itertools.pairwise(firsts)):
@@ -174,7 +178,12 @@ def planned_runs(
     def seeds_of(arm: str) -> Sequence[int]:
         if seeds is not None:
             return seeds
-        return range(FIRST_SEED, FIRST_SEED + arena.seeds.get(arm, 1), num_seeds)
+        count = arena.seeds.get(arm, 1)
+        if count % num_seeds:
+            raise ValueError(
+                f"--num-seeds is {num_seeds}, expected a divisor of the {count} seeds of {arm}"
+            )
+        return range(FIRST_SEED, FIRST_SEED + count, num_seeds)
 
     longest = max(len(seeds_of(arm)) for arm in chosen)
     return [

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from experiments.common import RESULTS
+from experiments.common import RESULTS, run
 from sqn_jax.agent.networks import Params, QNetwork, QOutput
 from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import Observation, make_env
@@ -29,6 +30,7 @@ from sqn_jax.evaluation.episodes import episode_keys, run_seeds
 from sqn_jax.evaluation.settings import SPAWN_MODES, task_key
 from sqn_jax.evaluation.statistics import wilson_interval
 from sqn_jax.policies.greedy import load_policy
+from sqn_jax.storage.files import probe_file, write_json
 from sqn_jax.training.state import network_of
 
 
@@ -136,18 +138,23 @@ def main() -> None:
     parser.add_argument("--eval-seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=RESULTS / "deployment.json")
     options = parser.parse_args()
+    for name in ("episodes", "eval_seeds"):
+        if getattr(options, name) < 1:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} is {getattr(options, name)}, expected 1 or more")
+    probe_file(options.out)
     results = measure(options.policy, options.map, options.episodes, options.eval_seeds)
     record = {
-        "command": "python experiments/deployment.py",
+        "command": " ".join(["python experiments/deployment.py", *sys.argv[1:]]),
         "policy": options.policy,
         "map": options.map,
         "eval_seeds": options.eval_seeds,
         "goal_radius_m": 0.3,
         "results": results,
     }
-    options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(options.out, record)
     print(f"wrote {options.out}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -37,8 +37,12 @@ class FakeNode:
         self.lines: list[str] = []
         self.destroyed = False
 
-    def declare_parameter(self, name: str, default: Any) -> Any:
-        return SimpleNamespace(value=self.overrides.get(name, default))
+    def declare_parameter(self, name: str, default: Any, descriptor: Any = None) -> Any:
+        """As in rclpy, what is given has the type of the default, or its type is dynamic."""
+        value = self.overrides.get(name, default)
+        if not (descriptor and descriptor.dynamic_typing) and type(value) is not type(default):
+            raise TypeError(f"InvalidParameterTypeException: {name}")
+        return SimpleNamespace(value=value)
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
         self.subscriptions_of[topic] = (kind, callback, qos)
@@ -112,6 +116,8 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Any:
         },
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
         "rclpy.time": {"Time": lambda: "latest"},
+        "rcl_interfaces": {},
+        "rcl_interfaces.msg": {"ParameterDescriptor": lambda **given: SimpleNamespace(**given)},
         "geometry_msgs": {},
         "geometry_msgs.msg": {
             "PoseStamped": SimpleNamespace,
@@ -300,8 +306,29 @@ def test_the_last_message_is_a_stop(ros: Any, end: type[BaseException]) -> None:
     assert order[2] == ([(0.0, 0.0)], True)
 
 
-def test_what_cannot_be_loaded_is_a_line(ros: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    FakeNode.overrides = {"slowdown": -1.0}
+def test_whole_numbers_are_numbers(ros: Any) -> None:
+    FakeNode.overrides = {"slowdown": 2, "bumper": 0, "rate": 10}
+    node = ros.Navigator()
+    assert node.timer[0] == pytest.approx(0.1)
+    assert node._controller.limits.slowdown == 2.0
+    assert node._controller.limits.bumper == 0.0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "line"),
+    [
+        ({"slowdown": -1.0}, "slowdown is -1.0, expected a positive number"),
+        ({"slowdown": "5"}, "slowdown is '5', expected a number"),
+        ({"bumper": True}, "bumper is True, expected a number"),
+        ({"rate": None}, "rate is None, expected a number"),
+        ({"stamped": 1}, "stamped is 1, expected true or false"),
+        ({"policy": 3}, "policy is 3, expected a text"),
+    ],
+)
+def test_what_cannot_be_loaded_is_a_line(
+    ros: Any, capsys: pytest.CaptureFixture[str], parameters: dict[str, Any], line: str
+) -> None:
+    FakeNode.overrides = parameters
     ros.rclpy.init = lambda **_: None
     ros.rclpy.shutdown = lambda: None
     ros.signal = SimpleNamespace(
@@ -310,6 +337,4 @@ def test_what_cannot_be_loaded_is_a_line(ros: Any, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit) as stop:
         ros.main()
     assert stop.value.code == 2
-    assert capsys.readouterr().err == (
-        "sqn_navigation: slowdown is -1.0, expected a positive number\n"
-    )
+    assert capsys.readouterr().err == f"sqn_navigation: {line}\n"

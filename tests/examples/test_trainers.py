@@ -39,10 +39,12 @@ def test_a_trainer_writes_its_curve(
         assert -0.2 <= row["eval_mean_reward"] < 60
 
 
-def test_a_map_that_is_none_is_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_what_is_unusable_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for arguments, fault in (
+        (["--out", str(tmp_path)], f"purejaxrl_ppo: {tmp_path}: "),
+        (["--out", str(tmp_path / "no" / "a.json")], f"purejaxrl_ppo: {tmp_path}/no/a.json: "),
         (["--map", "nowhere"], "purejaxrl_ppo: unknown map 'nowhere'"),
         (["--steps", "5"], "purejaxrl_ppo: --steps 5 are 0 updates, expected at least"),
     ):

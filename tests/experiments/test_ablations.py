@@ -52,8 +52,12 @@ def test_seeds_of_ones_own_and_side_by_side() -> None:
     assert [run.name for run in wide] == ["r2d2_seeds10to14", "r2d2_seeds15to19"]
     with pytest.raises(ValueError, match=r"--seeds \[3, 4\] with --num-seeds 2: seeds come twice"):
         planned_runs(arena, ["sqn"], [3, 4], 2)
-    (run,) = planned_runs(arena, ["sqn"], [3], 1, {"learner.discount": 0.9, "seed": 7})
+    (run,) = planned_runs(arena, ["sqn"], [3], 1, {"learner.discount": 0.9})
     assert (run.config.learner.discount, run.config.seed) == (0.9, 3)
+    with pytest.raises(ValueError, match=r"--set seed: expected --seeds and --num-seeds"):
+        planned_runs(arena, ["sqn"], [3], 1, {"seed": 7})
+    with pytest.raises(ValueError, match=r"--num-seeds is 2, expected a divisor of the 3 seeds"):
+        planned_runs(arena, ["dqn"], num_seeds=2)
 
 
 @pytest.mark.parametrize(

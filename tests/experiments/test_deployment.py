@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import common, deployment
 from experiments.deployment import SENSORS, Sensor, SensorNetwork, sensor_arrays
 from sqn_jax.config import EnvConfig
 from sqn_jax.env import Observation
@@ -45,3 +48,32 @@ def test_a_sensor_changes_what_it_does_not_see(sensor: Sensor, expected: tuple[f
 
 def test_one_of_the_sensors_is_that_of_the_training() -> None:
     assert seen(SENSORS["as trained"]) == pytest.approx(RANGES)
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--policy", "pretrained:none"], "pretrained:none"),
+        (["--map", "nowhere"], "nowhere"),
+        (["--episodes", "0"], "--episodes is 0, expected 1 or more"),
+        (["--out", "nowhere/a.json"], "nowhere/a.json"),
+    ],
+)
+def test_what_is_unusable_is_a_line(
+    words: list[str],
+    fault: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """And nothing is written: the default of --out is the record itself."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(common, "end_at_once", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["deployment.py", "--out", "found.json", *words])
+    with pytest.raises(SystemExit) as stopped:
+        common.run(deployment.main)
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert fault in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "found.json").exists()

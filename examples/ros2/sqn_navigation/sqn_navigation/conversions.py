@@ -67,7 +67,7 @@ def scan_to_sectors(
 
     Raises:
         ValueError: no beam returned anything: the sensor is covered, blind or off; or where its
-            beams point is unknown, or most directions are not covered and would read as `unseen`.
+            beams point is unknown, or they cover less than `LEAST_COVERED` of the directions.
     """
     readings = np.asarray(scan.ranges, np.float64)
     readings = np.where(np.isneginf(readings), scan.range_min, readings)

@@ -11,6 +11,7 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -49,8 +50,10 @@ class Navigator(Node):
 
     def __init__(self) -> None:
         super().__init__("sqn_navigation")
+        # Of any type, since ROS takes no 5 for 5.0; `as_declared` refuses the rest in a line.
+        anything = ParameterDescriptor(dynamic_typing=True)
         values = {
-            name: self.declare_parameter(name, default).value
+            name: as_declared(name, self.declare_parameter(name, default, anything).value)
             for name, default in PARAMETERS.items()
         }
         names = {limit.name for limit in dataclasses.fields(Limits)}
@@ -163,6 +166,21 @@ def mount_of(transform: Any) -> Mount:
     turn, where = transform.rotation, transform.translation
     parts = (turn.x, turn.y, turn.z, turn.w)
     return Mount(where.x, where.y, yaw_of(*parts), is_upside_down(*parts))
+
+
+def as_declared(name: str, value: Any) -> Any:
+    """A parameter as what `PARAMETERS` has under this name; a whole number is a number, too.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    kind = type(PARAMETERS[name])
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        words = {float: "a number", bool: "true or false", str: "a text"}
+        raise ValueError(f"{name} is {value!r}, expected {words[kind]}")
+    return value
 
 
 def main() -> None:
