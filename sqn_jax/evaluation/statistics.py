@@ -40,11 +40,11 @@ def seed_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
 
     A percentile bootstrap of so few values is too narrow: of ten by a fifth.
     """
-    from scipy import special
-
     array = np.asarray(values, np.float64)
     if array.size < 2:
         return None
+    from scipy import special
+
     quantile = special.stdtrit(array.size - 1, (1 + confidence) / 2)
     half = quantile * array.std(ddof=1) / math.sqrt(array.size)
     return float(array.mean() - half), float(array.mean() + half)

@@ -18,6 +18,8 @@ from sqn_jax.env.bumper import is_blocked
 from sqn_jax.maps import load_map
 
 FORWARD, BACKWARD, LEFT = 1, 2, 3
+ROOM = wrap_map(open_map(rows=100, columns=200), [(1.0, 1.0), (9.0, 4.0)])
+"""10 m x 5 m; the wall of one cell ends at x = 0.05 m."""
 blocked = jax.jit(is_blocked)
 take = jax.jit(step)
 
@@ -103,9 +105,7 @@ def test_what_is_near_elsewhere_does_not_let_it_into_a_wall(radius: float) -> No
 
 
 def test_it_stops_before_a_wall_and_lets_the_robot_go_along_and_away() -> None:
-    # 10 m x 5 m; the wall of one cell ends at x = 0.05 m.
-    occupancy_map = wrap_map(open_map(rows=100, columns=200), [(1.0, 1.0), (9.0, 4.0)])
-    params = make_env(occupancy_map, EnvConfig(bumper=0.05, robot_radius=0.1))
+    params = make_env(ROOM, EnvConfig(bumper=0.05, robot_radius=0.1))
     goal, key = jnp.array([9.0, 4.0]), jax.random.key(0)
 
     def moved(pose: tuple[float, float, float], action: int) -> tuple[float, bool, bool]:
@@ -130,8 +130,7 @@ def test_it_stops_before_a_wall_and_lets_the_robot_go_along_and_away() -> None:
 
 def stopped(config: EnvConfig, x: float, action: int, keys: int = 400) -> tuple[np.ndarray, ...]:
     """Refused and touched [keys] for a robot that faces the wall at 0.05 m, from x m."""
-    occupancy_map = wrap_map(open_map(rows=100, columns=200), [(1.0, 1.0), (9.0, 4.0)])
-    params = make_env(occupancy_map, config)
+    params = make_env(ROOM, config)
     key, goal = jax.random.key(0), jnp.array([9.0, 4.0])
     _, state = reset_to(key, jnp.array([x, 2.0, np.pi]), goal, params)
     each = jax.jit(jax.vmap(step, in_axes=(0, None, None, None)))
@@ -145,9 +144,8 @@ def test_it_sees_the_readings_with_their_noise() -> None:
     Readings that are 60 % off at most say 0.2 m to 0.8 m and 0.14 m to 0.56 m of the wall ahead.
     """
     config = EnvConfig(bumper=0.05, range_noise=0.6)
-    rng, angles = np.random.default_rng(0), BEAMS
+    rng, toward = np.random.default_rng(0), np.cos(BEAMS)
     for x in (0.55, 0.7, 0.4):
-        toward = np.cos(angles)
         true = np.where(toward > 0, (x - 0.05) / np.where(toward > 0, toward, 1.0), np.inf)
         # The near wall alone: the others are too far to stop anything.
         true = np.minimum(true, 5.0)
