@@ -158,19 +158,23 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
 def train_within(
     planned: Sequence[Run], arena: Arena, out: Path, minutes: float
 ) -> Iterator[Result]:
-    """Train and evaluate runs; none is begun when the longest so far would not fit any more."""
-    begun, longest = time.monotonic(), 0.0
-    for index, each in enumerate(planned):
+    """Train and evaluate runs; none is begun when the longest so far would not fit any more.
+
+    What is evaluated already takes no time: with 0 minutes nothing is trained.
+    """
+    begun, longest, left_out = time.monotonic(), 0.0, []
+    for each in planned:
         left = 60 * minutes - (time.monotonic() - begun)
         folder, path = out / each.name, out / f"{each.name}_scores.json"
-        if not path.is_file() and left < longest:
-            names = ", ".join(other.name for other in planned[index:])
-            print(f"--budget-minutes {minutes:g} are used up; not trained: {names}")
-            return
+        if not path.is_file() and left <= longest:
+            left_out.append(each.name)
+            continue
         started = time.monotonic()
         train_unless_done(each.config, folder)
         yield Result(each, scores_of(each, folder, arena, path), curve_of(folder))
         longest = max(longest, time.monotonic() - started)
+    if left_out:
+        print(f"--budget-minutes {minutes:g} are used up; not trained: {', '.join(left_out)}")
 
 
 def decision(scores: Scores, arena: Arena) -> dict[str, Any] | None:
@@ -229,7 +233,9 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, help="default: the arena's, from 10 on")
     parser.add_argument("--num-seeds", type=int, default=1, help="seeds side by side in a run")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="for all arms")
-    parser.add_argument("--budget-minutes", type=float, default=float("inf"))
+    parser.add_argument(
+        "--budget-minutes", type=float, default=float("inf"), help="0: none is trained"
+    )
     parser.add_argument(
         "--earlier",
         type=Path,

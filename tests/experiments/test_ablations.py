@@ -93,6 +93,11 @@ def test_no_run_is_begun_that_the_budget_has_no_room_for(
     done = [result.run.name for result in results]
     assert done == ["sqn_seed10", "r2d2_seed10"]
     assert "not trained: equal_seed10, sqn_seed11, r2d2_seed11" in capsys.readouterr().out
+    # What lies beyond a run that is left out counts, and with no minutes it alone does.
+    (tmp_path / "sqn_seed11_scores.json").touch()
+    for minutes, expected in ((12, [*done, "sqn_seed11"]), (0, ["sqn_seed11"])):
+        results = ablations.train_within(runs, ARENAS["smoke"], tmp_path, minutes)
+        assert [result.run.name for result in results] == expected
 
 
 def test_intervals_over_seeds_are_student_s_and_the_test_is_exact() -> None:
