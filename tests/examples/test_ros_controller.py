@@ -208,6 +208,43 @@ def test_the_bumper_stops_a_move_and_says_so_to_the_policy() -> None:
         assert policy.seen[-1][4] is False  # type: ignore[misc]
 
 
+def test_the_bumper_looks_at_every_scan_while_a_command_holds() -> None:
+    def stepping(ahead: float, time: float) -> tuple[list[Command], MotionPolicy]:
+        """Something is there at once, while 0.25 m in 0.5 s are commanded."""
+        policy = MotionPolicy()
+        controller = Controller(policy, Limits(bumper=0.05))
+        controller.set_goal((0.0, 30.0))
+        commands = []
+        for now, distance in ((0.0, 3.0), (time, ahead), (0.45, 3.0), (0.5, 3.0)):
+            controller.set_scan(scan(distance), Mount(), now)
+            commands.append(controller.tick(here, now))
+        return commands, policy
+
+    # 0.15 m or 0.05 m are left of the move, and 0.15 m must stay: body and bumper.
+    for ahead, time, second in (
+        *((0.31, 0.2, Command(0.5)), (0.29, 0.2, STOPPED)),
+        *((0.21, 0.4, Command(0.5)), (0.19, 0.4, STOPPED)),
+    ):
+        commands, policy = stepping(ahead, time)
+        assert commands == [Command(0.5), second, second, Command(0.5)]
+        assert len(policy.seen) == 2
+    controller, _ = driving()
+    controller.tick(here, 0.0)
+    controller.set_scan(scan(0.29), Mount(), 0.2)
+    # An old scan, of 0.2 s: what was left of the move then.
+    assert controller.tick(here, 0.4) == STOPPED
+
+
+def test_a_move_that_the_bumper_broke_off_was_refused() -> None:
+    policy = MotionPolicy()
+    controller = Controller(policy, Limits())
+    controller.set_goal((0.0, 30.0))
+    for now, ahead in ((0.0, 3.0), (0.2, 0.2), (0.5, 3.0), (1.0, 3.0)):
+        controller.set_scan(scan(ahead), Mount(), now)
+        controller.tick(lambda now=now: (now, 0.0, 0.0), now)  # type: ignore[misc]
+    assert [seen[4] for seen in policy.seen] == [False, True, False]  # type: ignore[misc]
+
+
 def test_a_wide_robot_shows_its_policy_thicker_obstacles_and_stops_sooner() -> None:
     controller, policy = driving(robot_radius=0.4, bumper=0.05)
     assert controller.tick(here, 0.0) == Command(0.5, 0.0)

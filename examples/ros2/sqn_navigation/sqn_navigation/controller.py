@@ -182,10 +182,18 @@ class Controller:
             self._ranges = self._seen(self._scan)
         if now < self._decided:  # The clock went back a little.
             self._decided_at = None
-        if not 0 <= now - self._decided < self.policy.time_step * self.limits.slowdown:
+        if not 0 <= now - self._decided < self._hold:
             self._command = self._decide(distance, heading, self._is_refused(here))
             self._decided, self._decided_at = now, here
+        if self._is_blocked():
+            self._stopped = True
+            self._command = Command(reason="the bumper stops the move")
         return self._command
+
+    @property
+    def _hold(self) -> float:
+        """s that a command holds."""
+        return float(self.policy.time_step) * self.limits.slowdown
 
     def _seen(self, scan: Scan) -> Any:
         max_range = self.policy.env["max_range"]
@@ -206,8 +214,20 @@ class Controller:
             return False
         if self._stopped or not self.obeyed:
             return self._stopped
-        commanded = abs(self._command.speed) * self.policy.time_step * self.limits.slowdown
+        commanded = abs(self._command.speed) * self._hold
         return math.dist(here[:2], self._decided_at[:2]) < commanded / 10
+
+    def _is_blocked(self) -> bool:
+        """Whether the scan shows what is left of the move, since it was measured, to be blocked."""
+        left = max(0.0, self._hold - max(0.0, self._scan_time - self._decided))
+        return self.limits.bumper > 0 and is_blocked(
+            self._ranges,
+            self.policy.beam_angles,
+            self._command.speed * left,
+            radius=self._radius,
+            reach=self._radius + self.limits.bumper,
+            max_range=self.policy.env["max_range"],
+        )
 
     def _decide(self, distance: float, heading: float, refused: bool) -> Command:
         angles, ranges = self.policy.beam_angles, self._ranges
@@ -216,16 +236,7 @@ class Controller:
         # Only a policy that was trained with motion inputs looks at its last move.
         more = {"refused": refused} if getattr(self.policy, "motion_size", 0) else {}
         velocity, self._hidden = self.policy.act(ranges, distance, heading, self._hidden, **more)
-        self._stopped = self.limits.bumper > 0 and is_blocked(
-            self._ranges,
-            angles,
-            float(velocity[0]) * self.policy.time_step,
-            radius=self._radius,
-            reach=self._radius + self.limits.bumper,
-            max_range=self.policy.env["max_range"],
-        )
-        if self._stopped:
-            return Command(reason="the bumper stops the move")
+        self._stopped = False
         slow = (velocity[0] / self.limits.slowdown, velocity[1] / self.limits.slowdown)
         speed, turn_rate = limited(slow, self.limits.max_speed, self.limits.max_turn_rate)
         return Command(float(speed), float(turn_rate))
