@@ -9,6 +9,9 @@ from tqdm import tqdm
 
 from sqn_jax.outside.messages import say
 
+MANY_MAPS = 20
+"""So many take long to prepare: on a slow machine minutes for some hundred."""
+
 
 def episodes_bar(total: int, done: int = 0, *, is_shown: bool = True) -> tqdm[Any]:
     """A progress bar over episodes; updated less often where stderr is not a terminal."""
@@ -27,3 +30,9 @@ def episodes_bar(total: int, done: int = 0, *, is_shown: bool = True) -> tqdm[An
 def phase(name: str) -> None:
     """Say what a command does now, where it has no bar for it."""
     say(f"{name} ...", error=True, flush=True)
+
+
+def preparing(num_maps: int) -> None:
+    """Say that maps are prepared, where they are so many that it takes a while."""
+    if num_maps >= MANY_MAPS:
+        phase(f"preparing {num_maps} maps")

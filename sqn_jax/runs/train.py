@@ -34,7 +34,7 @@ from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, require_same_network, started_from
 from sqn_jax.runs import divergence, final_evaluation, streams
 from sqn_jax.runs.learning_curve import LearningCurve, summary_of
-from sqn_jax.runs.progress import episodes_bar, phase
+from sqn_jax.runs.progress import episodes_bar, phase, preparing
 from sqn_jax.runs.resuming import restored
 from sqn_jax.runs.signals import Interrupted, deferred, wait_for
 from sqn_jax.runs.tensorboard import Board, require_tensorboard
@@ -154,6 +154,7 @@ def _set_up(
     memory_budget.bound_programs()
     devices.use_cores()
     mesh = devices.choose(config, num_devices)
+    preparing(len(config.maps.names))
     occupancy_map = load_map(config.maps, robot_radius=config.env.robot_radius)
     env_params = make_env(occupancy_map, config.env)
     _warn_of_short_episodes(occupancy_map, config)
@@ -208,12 +209,8 @@ def _warn_of_short_episodes(occupancy_map: OccupancyMap, config: TrainConfig) ->
     """Warn if the limit that a map file sets is too short for its paths."""
     from_files = any(isinstance(name, MapFile) for name in config.maps.names)
     if from_files and config.env.max_steps == 0:
-        line = step_warning(
-            occupancy_map,
-            config.env.robot_radius,
-            config.env.forward_speed * config.env.time_step,
-            config.env.goal_radius,
-        )
+        step = config.env.forward_speed * config.env.time_step
+        line = step_warning(occupancy_map, config.env.robot_radius, step, config.env.goal_radius)
         if line is not None:
             warnings.warn(line, stacklevel=2)
 

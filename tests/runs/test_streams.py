@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sqn_jax.runs import streams
+from sqn_jax.config import TrainConfig
+from sqn_jax.runs import streams, train
 
 # Prints to both, then opens a file as a run does, and says what became of it in that file.
 PROGRAM = """
@@ -84,3 +85,16 @@ def test_streams_of_others_have_not_failed(monkeypatch: pytest.MonkeyPatch) -> N
     assert not streams.reader_left()
     monkeypatch.setattr(sys, "stderr", None)
     assert not streams.reader_left()
+
+
+def test_a_run_on_many_maps_says_that_it_prepares_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no map")
+
+    monkeypatch.setattr(train, "load_map", refuse)
+    for last, said in ((18, ""), (19, "preparing 20 maps ...\n")):
+        with pytest.raises(ValueError, match="no map"):
+            train.train_session(TrainConfig(map=f"maze:0-{last}"), tmp_path / "run")
+        assert capsys.readouterr().err == said
