@@ -22,7 +22,12 @@ from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.evaluation.statistics import seed_interval
-from sqn_jax.policies.interventions import fix_skill_weights, swap_skills, without_skill
+from sqn_jax.policies.interventions import (
+    fix_skill_weights,
+    single_head,
+    swap_skills,
+    without_skill,
+)
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, of_seed
 from sqn_jax.runs.evaluate import evaluate_session
@@ -46,13 +51,14 @@ Flags = NDArray[np.bool_]
 def variants(policy: Policy) -> dict[str, Policy]:
     """The policy, each of its skills alone, without each of them, and exchanged, by name.
 
-    Of two skills one is alone where the other is taken out; a gate that was not learned cannot be
-    changed.
+    Of two skills one is alone where the other is taken out. Of a gate that was not learned only
+    what each skill does alone.
     """
-    if policy.config.network.gate != "learned":
-        return {AS_IT_IS: policy}
     count = policy.config.network.num_skills
     numbered = [(index, index + 1) for index in range(count)]
+    if policy.config.network.gate != "learned":
+        alone = {f"skill {number} alone": single_head(policy, index) for index, number in numbered}
+        return {AS_IT_IS: policy, **alone}
     changed = {
         f"skill {number} alone": fix_skill_weights(policy, np.eye(count)[index].tolist())
         for index, number in numbered

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
+import jax
 import numpy as np
 import pytest
+from rooms import random_params, small_room
 
 from experiments.skills import (
     AS_IT_IS,
@@ -16,9 +18,12 @@ from experiments.skills import (
     weights_by_situation,
     weights_over_time,
 )
-from sqn_jax.agent import QOutput, Trajectory
-from sqn_jax.env import Observation
+from sqn_jax.agent import QOutput, Trajectory, initial_carry, make_network
+from sqn_jax.config import NetworkConfig, TrainConfig
+from sqn_jax.env import NUM_ACTIONS, Observation
 from sqn_jax.policies.pretrained import load_pretrained
+from sqn_jax.policies.run_policies import Policy
+from sqn_jax.training.state import network_of
 
 
 def trajectory(steps: list[tuple[float, float, bool, float]]) -> Trajectory:
@@ -63,6 +68,29 @@ def test_a_situation_that_never_came_is_not_told() -> None:
 def test_every_skill_is_tried_alone() -> None:
     names = list(variants(load_pretrained("sqn")))
     assert names == ["as it is", "skill 1 alone", "skill 2 alone", "exchanged"]
+
+
+@pytest.mark.parametrize("gate", ["equal", "reachable"])
+def test_every_skill_is_tried_alone_where_the_gate_was_not_learned(gate: Any) -> None:
+    config = TrainConfig(network=NetworkConfig(hidden_size=8, gate=gate))
+    network = make_network("sqn", config.network, NUM_ACTIONS, config.env)
+    found = variants(Policy("made up", config, (random_params(network, small_room(9)),)))
+    assert list(found) == ["as it is", "skill 1 alone", "skill 2 alone"]
+
+    obs = Observation(
+        ranges=jax.random.uniform(jax.random.key(1), (6, 2, 71)),
+        goal=jax.random.uniform(jax.random.key(2), (6, 2, 2)),
+    )
+
+    def output(policy: Policy) -> QOutput:
+        carry = initial_carry(config.network, 2)
+        result: Any = network_of(policy.config).apply(policy.params[0], obs, carry)
+        return cast(QOutput, result[1])
+
+    for index in range(2):
+        alone = output(found[f"skill {index + 1} alone"])
+        expected = output(found["as it is"]).skill_q_values[:, :, index]
+        np.testing.assert_allclose(alone.q_values, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_mutual_information_by_hand() -> None:
