@@ -111,7 +111,9 @@ class Bug:
 
     def __post_init__(self) -> None:
         if self.turn <= 0 or self.stride <= 0:
-            raise ValueError("the robot cannot move or turn, expected speeds above 0")
+            raise ValueError(
+                "the robot cannot move or turn, expected speeds above 0 (or --no-baselines)"
+            )
 
     @property
     def turn(self) -> float:

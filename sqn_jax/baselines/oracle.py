@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from sqn_jax.baselines.beam import Beam, trace_back
 from sqn_jax.baselines.shortest_paths import ShortestPaths, wrapped_once
+from sqn_jax.config import EnvConfig
 from sqn_jax.env import EnvParams
 from sqn_jax.env.geometry import wrap_angle
 from sqn_jax.env.navigation import BACKWARD, FORWARD, LEFT, RIGHT, STAND
@@ -139,8 +140,19 @@ def _require_plannable(occupancy_map: OccupancyMap, env_params: EnvParams) -> No
             f"map {occupancy_map.name!r} has {occupancy_map.shape} cells, "
             f"expected {env_params.body.shape} as in env_params"
         )
-    if min(config.forward_speed, config.backward_speed, config.turn_rate, config.time_step) <= 0:
-        raise ValueError("the robot cannot move or turn, expected speeds above 0")
+    require_mobile(config)
+
+
+def require_mobile(config: EnvConfig) -> None:
+    """Refuse a robot that the oracle cannot plan for.
+
+    Raises:
+        ValueError: one line: it cannot move both ways and turn.
+    """
+    if min(config.forward_speed, config.backward_speed, config.turn_rate) <= 0:
+        raise ValueError(
+            "the robot cannot move or turn, expected speeds above 0 (or --no-baselines)"
+        )
 
 
 class BeamSearch:
@@ -345,6 +357,9 @@ class BeamSearch:
     def _line_is_free(self, start: Floats, line: Floats) -> NDArray[np.bool_]:
         """Whether every cell that segments [N, 2] cross is free; beyond the border nothing is."""
         start, line = start / self.resolution, line / self.resolution
+        # So far from within the map a line is beyond its border: what follows changes nothing.
+        farthest = max(self.free.shape) + 1.0
+        line = line / np.maximum(1.0, np.abs(line).max(axis=1, keepdims=True) / farthest)
         most = int(np.ceil(np.abs(line).max(initial=0.0))) + 1
         # Borders crossed, as fractions of the line; between two of them lies one cell.
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -45,6 +45,8 @@ def evaluate(arguments: list[str]) -> int:
     if options.out is None:
         streams.require_output("--out FILE for the results")
     else:
+        if tasks_file is not None and options.out.resolve() == tasks_file.resolve():
+            raise ValueError(f"--out {options.out}: is the file of --tasks, expected another one")
         _require_writable(options.out)
     if tasks_file is None:
         _evaluate_drawn_tasks(options)

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sqn_jax.agent.networks import Params, QNetwork
 from sqn_jax.agent.trajectory import Trajectory
+from sqn_jax.baselines.bug import Bug
+from sqn_jax.baselines.oracle import require_mobile
 from sqn_jax.config import EnvConfig, TrainConfig
 from sqn_jax.config.validation import require_limits
 from sqn_jax.evaluation import baseline_episodes, episodes
@@ -67,6 +69,29 @@ class Agent(Protocol):
         Returns:
             For each evaluation seed and each training seed the results of E episodes.
         """
+
+
+def require_robot(agent: Agent, robot: EnvConfig) -> None:
+    """Refuse a robot that an agent cannot drive, before anything is run.
+
+    Args:
+        agent: a trained policy or a baseline.
+        robot: the robot of an evaluation: the agent's own with what a suite or the settings fix.
+
+    Raises:
+        ValueError: one line: a policy was trained with another number of beams, or the robot of a
+            baseline cannot move.
+    """
+    num_beams = agent.env_config.num_beams
+    if isinstance(agent, TrainedAgent) and robot.num_beams != num_beams:
+        raise ValueError(
+            f"robot.num_beams is {robot.num_beams}, expected {num_beams}, with which "
+            f"{agent.name} was trained"
+        )
+    if agent.algorithm == "oracle":
+        require_mobile(robot)
+    if agent.algorithm == "bug":
+        Bug(robot)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from sqn_jax.evaluation.agents import (
     OnBatch,
     TrainedAgent,
     bumper_of,
+    require_robot,
 )
 from sqn_jax.evaluation.cached_paths import path_lengths
 from sqn_jax.evaluation.episodes import EpisodeResults
@@ -89,11 +90,13 @@ def load_maps(agents: Sequence[Agent], settings: Settings) -> Maps:
     Files of one name are told apart by their folders: the maps are called `hall/map`, `yard/map`.
 
     Raises:
-        ValueError: a map is unusable for a robot.
+        ValueError: a map is unusable for a robot, or a robot for an agent.
 
     Warns:
         UserWarning: see `load_map`; or an episode is too short for the paths of a map file.
     """
+    for agent in agents:
+        require_robot(agent, robot_for(agent.env_config, settings))
     robots = {
         robot.robot_radius: robot
         for robot in (robot_for(agent.env_config, settings) for agent in agents)

@@ -42,7 +42,10 @@ def evaluation_distances(
 
 
 def describe(
-    occupancy_map: OccupancyMap, robot_radius: float = 0.1, step_length: float = 0.25
+    occupancy_map: OccupancyMap,
+    robot_radius: float = 0.1,
+    step_length: float = 0.25,
+    goal_radius: float = 0.3,
 ) -> str:
     """A readable report of several lines: size, free space, points, distances, warnings.
 
@@ -50,6 +53,7 @@ def describe(
         occupancy_map: a map that `validate` accepts.
         robot_radius: m; free space and distances are those of a robot of this size.
         step_length: m moved in one step, to judge `max_steps`.
+        goal_radius: m; a goal is reached when it is so near.
     """
     rows, cols = occupancy_map.shape
     width, height = occupancy_map.size_m
@@ -71,7 +75,7 @@ def describe(
         f"max steps      {occupancy_map.max_steps}",
         f"evaluation     {len(occupancy_map.evaluation_points)} points",
     ]
-    warnings = occupancy_map.warnings
+    warnings = occupancy_map.warnings + _near_warnings(occupancy_map, goal_radius)
     if is_searchable(used):
         geodesic, straight = evaluation_distances(occupancy_map, robot_radius)
         lines += _pair_lines(occupancy_map, geodesic, straight)
@@ -80,6 +84,20 @@ def describe(
         lines.append(f"               (more than {MAX_SEARCHED_CELLS:,} free cells: no distances)")
     lines += [f"warning        {line}" for line in warnings] or ["warnings       none"]
     return "\n".join(lines)
+
+
+def _near_warnings(occupancy_map: OccupancyMap, goal_radius: float) -> tuple[str, ...]:
+    """A line for two evaluation points of which one lies within the goal radius of the other."""
+    points = occupancy_map.evaluation_points
+    for i, point in enumerate(points):
+        apart = np.linalg.norm(points[i + 1 :] - point, axis=-1)
+        for j in np.flatnonzero(apart < goal_radius)[:1]:
+            return (
+                f"evaluation points {i} and {i + 1 + j} are {apart[j]:.2f} m apart, less than the "
+                f"goal radius of {goal_radius:g} m: such a task is nearly solved when it "
+                "begins",
+            )
+    return ()
 
 
 def _step_warnings(
@@ -148,7 +166,7 @@ def _pair_lines(
     lines.append("  pair         geodesic  straight  ratio")
     for i, j in combinations(range(len(points)), 2):
         # Two evaluation points in one place have no ratio.
-        ratio = geodesic[i, j] / straight[i, j] if straight[i, j] > 0 else math.nan
+        ratio = f"{geodesic[i, j] / straight[i, j]:5.2f}" if straight[i, j] > 0 else "    -"
         pair = f"{i} - {j}"
-        lines.append(f"  {pair:12} {geodesic[i, j]:6.2f} m  {straight[i, j]:6.2f} m  {ratio:5.2f}")
+        lines.append(f"  {pair:12} {geodesic[i, j]:6.2f} m  {straight[i, j]:6.2f} m  {ratio}")
     return lines

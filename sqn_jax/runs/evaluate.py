@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sqn_jax.baselines.shortest_paths import require_paths
-from sqn_jax.evaluation.agents import Agent
+from sqn_jax.evaluation.agents import Agent, require_robot
 from sqn_jax.evaluation.cached_work import cached_work
 from sqn_jax.evaluation.compare import (
     RECORD_BYTES,
@@ -86,8 +86,8 @@ def evaluate_suite_session(
         The contents of the evaluation file, and the records of the episodes.
 
     Raises:
-        ValueError: a map is unusable, a task cannot be solved, or the episodes do not fit into
-            memory; nothing has been run.
+        ValueError: an agent cannot drive the suite's robot, a map is unusable, a task cannot be
+            solved, or the episodes do not fit into memory; nothing has been run.
     """
     episodes = num_suite_episodes(agents, suite, settings)
     memory_budget.require(RECORD_BYTES * episodes, "keeping the episodes", "evaluate")
@@ -106,8 +106,11 @@ def suite_maps(
     """What makes the maps of a suite, by the radius of a robot, m; its tasks are checked.
 
     Raises:
-        ValueError: a map is unusable, or a task cannot be solved.
+        ValueError: an agent cannot drive the suite's robot, a map is unusable, or a task cannot be
+            solved.
     """
+    for agent in agents:
+        require_robot(agent, robot_for(agent.env_config, suite))
     radii = {robot_for(agent.env_config, suite).robot_radius for agent in agents}
     maps = {radius: SuiteMaps(partial(load_map, robot_radius=radius)) for radius in radii}
     for radius in radii:

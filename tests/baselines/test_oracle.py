@@ -249,6 +249,16 @@ def test_what_the_plan_allows_the_simulator_grants(maze: tuple[OccupancyMap, Env
         assert np.mean(~clear & ~np.asarray(refused)) < 0.02
 
 
+def test_no_move_leads_out_of_the_map_however_long_it_is() -> None:
+    """By the length of a row of cells it would take terabytes."""
+    small, _ = small_room()
+    world = make_env(small, EnvConfig(forward_speed=100.0, time_step=10.0))
+    search = BeamSearch(small, world, np.array([[5.025, 2.025]]))
+    poses = np.array([[1.025, 1.025, heading] for heading in np.arange(0, 6.3, 0.1)])
+    assert not search.is_clear(poses, 1e9).any()
+    assert search.is_clear(poses, 0.25).all()
+
+
 def test_shortest_paths_know_distance_direction_and_bends() -> None:
     corner = room(6, 6, [(1, 1), (5, 5)], (0.05, 4.0, 2.0, 6.0))
     free = traversable(corner.occupied, 0.05, 0.1)

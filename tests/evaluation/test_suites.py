@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refusal
 from rooms import random_params
 
 from sqn_jax.agent import make_network
@@ -22,12 +23,13 @@ from sqn_jax.agent.networks import initial_carry
 from sqn_jax.agent.trajectory import Trajectory
 from sqn_jax.cli import main
 from sqn_jax.config import EnvConfig, NetworkConfig, TrainConfig
-from sqn_jax.env import EnvParams, make_env, reset_to, step
+from sqn_jax.env import NUM_ACTIONS, EnvParams, make_env, reset_to, step
 from sqn_jax.evaluation import episodes, suite_recording, suite_scores, suites
 from sqn_jax.evaluation.agents import BaselineAgent, TrainedAgent
 from sqn_jax.evaluation.settings import SuiteSettings
 from sqn_jax.maps import OccupancyMap
 from sqn_jax.policies.run_policies import Policy
+from sqn_jax.runs.evaluate import suite_maps
 from sqn_jax.tasks import Task, TaskSuite
 from sqn_jax.training.rollout import episode_metrics
 
@@ -362,6 +364,19 @@ def test_what_cannot_be_evaluated_is_one_line(
     assert error.count("\n") == 1
 
 
+def test_the_results_do_not_replace_the_tasks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "suite.json"
+    file.write_text("the tasks")
+    monkeypatch.chdir(tmp_path)
+    for out in (str(file), "suite.json", "../" + tmp_path.name + "/suite.json"):
+        assert main(["evaluate", "--tasks", str(file), "--out", out]) == 2
+        error = capsys.readouterr().err
+        assert "is the file of --tasks, expected another one" in error
+    assert file.read_text() == "the tasks"
+
+
 @pytest.mark.parametrize("command", ["evaluate", "render"])
 def test_a_bumper_is_said_by_the_suite_or_by_the_option(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -391,6 +406,25 @@ def test_a_chunk_is_made_while_the_one_before_is_used() -> None:
     assert second_is_made.wait(10), "while the first is used"
     assert 3 not in made, "no more than one"
     assert list(ahead) == [2, 3]
+
+
+def test_a_robot_that_an_agent_cannot_drive_is_refused_before_anything_is_run() -> None:
+    """Its network takes 71 beams; both baselines have to move."""
+    config = TrainConfig(network=NETWORK)
+    network = make_network("sqn", NETWORK, NUM_ACTIONS)
+    params = random_params(network, make_env(ROOMS["wide"], EnvConfig()))
+    trained = TrainedAgent("mine", (Policy("mine", config, (params,)),))
+    oracle, bug = (BaselineAgent(name, EnvConfig()) for name in ("oracle", "bug"))
+
+    def refused(agent: Any, **robot: float) -> str:
+        suite = TaskSuite("some", (task("wide", (1, 1), (2, 1)),), tuple(robot.items()))
+        return refusal(lambda: suite_maps([agent], suite))
+
+    said = refused(trained, num_beams=10)
+    assert said == "robot.num_beams is 10, expected 71, with which mine was trained"
+    for agent in (oracle, bug):
+        for slow in ({"forward_speed": 0.0}, {"turn_rate": 0.0}):
+            assert refused(agent, **slow).startswith("the robot cannot move or turn")
 
 
 def test_what_goes_wrong_ahead_is_said_in_its_turn() -> None:

@@ -173,6 +173,16 @@ def test_the_report_names_what_a_person_asks_for() -> None:
     assert "max_steps is 5" in describe(room_map(max_steps=5), 0.1)
 
 
+@pytest.mark.parametrize(("x", "is_warned"), [(1.0, True), (1.25, True), (1.35, False)])
+def test_evaluation_points_within_the_goal_radius_of_each_other_are_warned_of(
+    x: float, is_warned: bool
+) -> None:
+    report = describe(room_map(evaluation_points=np.array([[2.0, 2.5], [1.0, 1.0], [x, 1.0]])), 0.1)
+    apart = f"evaluation points 1 and 2 are {x - 1:.2f} m apart, less than the goal radius of 0.3 m"
+    assert (apart in report) == is_warned
+    assert "nan" not in report
+
+
 def test_the_report_holds_few_distance_fields_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     # Nine points in the open: no way is shorter than the line, and none much longer.
     points = np.stack(np.meshgrid([0.5, 1.2, 2.1], [0.5, 1.5, 2.5]), axis=-1).reshape(-1, 2)
