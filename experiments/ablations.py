@@ -34,18 +34,20 @@ from experiments.arm_statistics import (
 from experiments.common import run, train_unless_done
 from sqn_jax import config as configs
 from sqn_jax import figures
+from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent, with_epsilons
 from sqn_jax.evaluation.settings import Settings, Tasks
 from sqn_jax.outside.reading import read_json
 from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs.evaluate import evaluate_session
-from sqn_jax.storage.files import write_json
+from sqn_jax.storage.files import write_json, write_whole
 from sqn_jax.storage.metrics import evaluated_rows
 from sqn_jax.storage.run_folder import RunFolder
 
 TASKS: tuple[Tasks, ...] = ("evaluation points", "random pairs")
 PRIMARY_TASKS: Tasks = "random pairs"
 
+SCHEMA = 1
 MAX_SCORES_BYTES = 2**24
 
 CURVE = ("episodes", "mean_reward", "success", "eval_mean_reward", "eval_success")
@@ -88,8 +90,7 @@ def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict
             raise ValueError(
                 f"{path}: of another run or evaluation, expected --out to name a folder"
             )
-        scores: list[dict[str, Any]] = found["scores"]
-        return scores
+        return whole_scores(found.get("scores"), trained.config, arena, f"{path}")
     rows: dict[tuple[Any, ...], dict[str, list[float]]] = {}
 
     def keep(batch: EpisodeBatch) -> None:
@@ -113,6 +114,49 @@ def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict
     return scores
 
 
+def whole_scores(rows: Any, config: TrainConfig, arena: Arena, source: str) -> list[dict[str, Any]]:
+    """Rows read from a file, once they are what an evaluation of a run writes.
+
+    Raises:
+        ValueError: one line that begins with the source: a row is missing, comes twice or is of
+            something else, or a number is none or out of its range.
+    """
+    seeds = range(config.seed, config.seed + config.num_seeds)
+    asked = itertools.product(seeds, arena.maps, TASKS, arena.epsilons)
+    try:
+        found = [(row["seed"], row["map"], row["tasks"], row["epsilon"]) for row in rows]
+        is_asked = sorted(found) == sorted(asked)
+        is_sound = all(
+            0 <= row["spl"] <= 1 and 0 <= row["success"] <= 1 and row["time_steps"] >= 0
+            for row in rows
+        )
+    except (AttributeError, KeyError, TypeError):
+        raise ValueError(f"{source} has scores that are none, expected those of a run") from None
+    if not is_asked:
+        raise ValueError(f"{source} has scores of other maps or tasks")
+    if not is_sound:
+        raise ValueError(f"{source} has scores out of range, expected SPL and success from 0 to 1")
+    return list(rows)
+
+
+def whole_curve(rows: Any, source: str) -> list[dict[str, Any]]:
+    """A learning curve read from a file, once it is one.
+
+    Raises:
+        ValueError: one line that begins with the source.
+    """
+    numbers = (int, float, type(None))
+    is_whole = isinstance(rows, list) and all(
+        isinstance(row, dict)
+        and isinstance(row.get("episodes"), int)
+        and all(name in CURVE and isinstance(value, numbers) for name, value in row.items())
+        for row in rows
+    )
+    if not is_whole:
+        raise ValueError(f"{source} has a curve that is none, expected rows of {', '.join(CURVE)}")
+    return list(rows)
+
+
 def curve_of(folder: Path) -> list[dict[str, Any]]:
     """The learning curve of a run as a record keeps it."""
     metrics = RunFolder.open(folder)[0].read_metrics()
@@ -134,24 +178,27 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
     record = read_json(path, MAX_SCORES_BYTES, "ablations.json")
     if not isinstance(record, dict) or record.get("arena") != name:
         raise ValueError(f"{path}: expected an ablations.json of the arena {name}")
-    arena, results = ARENAS[name], {}
-    places = set(itertools.product(arena.maps, TASKS, arena.epsilons))
-    try:
-        for each in planned:
+    if record.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: schema is {record.get('schema')!r}, expected {SCHEMA}")
+    results = {}
+    for each in planned:
+        source = f"{path}: {each.name}"
+        seeds = range(each.config.seed, each.config.seed + each.config.num_seeds)
+        try:
             settings = record["settings"].get(each.name)
             if settings is None:
                 continue
-            if configs.from_dict(settings) != each.config:
-                raise ValueError(f"{path}: {each.name} has other settings than it has here")
-            seeds = range(each.config.seed, each.config.seed + each.config.num_seeds)
+            config = configs.from_dict(settings)
             rows = [row for row in record["scores"][each.arm] if row["seed"] in seeds]
-            found = [(row["seed"], row["map"], row["tasks"], row["epsilon"]) for row in rows]
-            if sorted(found) != sorted((seed, *place) for seed in seeds for place in places):
-                raise ValueError(f"{path}: {each.name} has scores of other maps or tasks")
             curve = record.get("curves", {}).get(each.name, [])
-            results[each.name] = Result(each, rows, curve)
-    except (AttributeError, KeyError, TypeError):
-        raise ValueError(f"{path}: not a whole ablations.json") from None
+        except (AttributeError, KeyError, TypeError):
+            raise ValueError(f"{path}: not a whole ablations.json") from None
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+        if config != each.config:
+            raise ValueError(f"{source} has other settings than it has here")
+        scores = whole_scores(rows, each.config, ARENAS[name], source)
+        results[each.name] = Result(each, scores, whole_curve(curve, source))
     return results
 
 
@@ -161,11 +208,16 @@ def train_within(
     """Train and evaluate runs; none is begun when the longest so far would not fit any more.
 
     What is evaluated already takes no time: with 0 minutes nothing is trained.
+
+    Raises:
+        ValueError: there are scores of a run without the run.
     """
     begun, longest, left_out = time.monotonic(), 0.0, []
     for each in planned:
         left = 60 * minutes - (time.monotonic() - begun)
         folder, path = out / each.name, out / f"{each.name}_scores.json"
+        if path.is_file() and not (folder / "summary.json").is_file():
+            raise ValueError(f"{path}: scores of a run that {folder} does not have, delete them")
         if not path.is_file() and left <= longest:
             left_out.append(each.name)
             continue
@@ -195,13 +247,13 @@ def write_results(name: str, results: Sequence[Result], out: Path) -> str:
     decided = decision(scores, arena)
     settings = {each.run.name: configs.to_public_dict(each.run.config) for each in results}
     curves = {each.run.name: each.curve for each in results if each.curve}
-    record = {"schema": 1, "arena": name, "decision": decided, "results": compared}
+    record = {"schema": SCHEMA, "arena": name, "decision": decided, "results": compared}
     record |= {"scores": scores, "settings": settings, "curves": curves}
     write_json(out / "ablations.json", record)
     page = f"# Arena {name}\n\n{arms_table(compared)}\n"
     if decided is not None:
         page += f"\n{decision_line(decided)}\n"
-    (out / "ablations.md").write_text(page, encoding="utf-8")
+    write_whole(out / "ablations.md", page)
     draw_curves(name, results, out / "learning_curves.png")
     others = [entry for entry in compared if entry["difference"] is not None]
     if others:
@@ -246,6 +298,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.num_seeds < 1:
         raise ValueError(f"--num-seeds is {options.num_seeds}, expected at least 1")
+    if not options.budget_minutes >= 0:
+        raise ValueError(f"--budget-minutes is {options.budget_minutes:g}, expected 0 or more")
     arena = ARENAS[options.arena]
     planned = planned_runs(
         arena, options.arms, options.seeds, options.num_seeds, parse_changes(options.set)

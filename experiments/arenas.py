@@ -130,16 +130,16 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
     """Settings and values out of NAME=VALUE; what is no JSON is a text.
 
     Raises:
-        ValueError: there is no "=".
+        ValueError: there is no "=", or nothing before it.
     """
     changes = {}
     for text in texts:
         name, is_one, value = text.partition("=")
-        if not is_one:
+        if not (name and is_one):
             raise ValueError(f"--set {text}: expected NAME=VALUE")
         try:
             changes[name] = json.loads(value)
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, RecursionError):
             changes[name] = value
     return changes
 
@@ -163,13 +163,18 @@ def planned_runs(
         changes: to the settings of all arms.
 
     Raises:
-        ValueError: a setting is unknown or out of its range, runs would have seeds in common, or
-            more seeds than the arena says.
+        ValueError: a setting is unknown, out of its range or what arms differ in, an arm comes
+            twice, runs would have seeds in common, or more seeds than the arena says.
     """
     for name in ("seed", "num_seeds"):
         if name in (changes or {}):
             raise ValueError(f"--set {name}: expected --seeds and --num-seeds to say it")
+    for name in changes or {}:
+        if any(name in of_arm for of_arm in ARMS.values()):
+            raise ValueError(f"--set {name}: is what arms differ in, expected --arms to say it")
     chosen = list(arena.seeds) if arms is None else list(arms)
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"--arms {' '.join(chosen)}: one comes twice")
     firsts = sorted(seeds or [])
     if any(later - earlier < num_seeds for earlier, later in itertools.pairwise(firsts)):
         raise ValueError(f"--seeds {firsts} with --num-seeds {num_seeds}: seeds come twice")

@@ -118,8 +118,8 @@ def train_unless_done(config: TrainConfig, folder: Path) -> None:
     begun = (folder / "config.json").is_file()
     if begun and RunFolder.open(folder)[1] != config:
         raise ValueError(
-            f"run folder {folder}: holds a run with other settings, expected --runs to name a "
-            "folder for these"
+            f"run folder {folder}: holds a run with other settings, expected a folder for these "
+            "(--runs or --out)"
         )
     if (folder / "summary.json").is_file():
         print(f"{folder} is trained")
@@ -133,8 +133,11 @@ def run(main: Any) -> None:
     end_at_once()
     try:
         main()
-    except (ValueError, OSError, json.JSONDecodeError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+    except (ValueError, OSError) as error:
+        reason = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            reason = f"{error.filename}: {error.strerror}"
+        print(f"{name}: {reason}", file=sys.stderr)
         raise SystemExit(1 if isinstance(error, NotSaved) else 2) from None
     except FloatingPointError as error:  # Learning has diverged.
         print(f"{name}: {error}", file=sys.stderr)

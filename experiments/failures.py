@@ -19,7 +19,7 @@ from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.runs.evaluate import evaluate_session
-from sqn_jax.storage.files import write_json
+from sqn_jax.storage.files import probe_file, write_json
 
 LAST_STEPS = 200
 STILL = 1.0
@@ -68,6 +68,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    names = [Path(word).name for word in options.policies]
+    if len(set(names)) < len(names):
+        raise ValueError(f"policies {', '.join(names)}: one name comes twice")
+    probe_file(options.out)
     settings = Settings(maps=(options.map,), episodes=options.episodes, eval_seeds=1)
     agents = [TrainedAgent(word, (find_policy(word),)) for word in options.policies]
     by_policy = {}

@@ -22,6 +22,7 @@ from sqn_jax.evaluation.scores import results_table
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.storage.files import write_whole
 
 VELOCITY_NOISE = (0.1, 0.2, 0.3)
 RANGE_NOISE = (0.2, 0.4, 0.6)
@@ -56,7 +57,7 @@ def main() -> None:
     figure = figures.robustness(shown, title=f"Robustness, {options.map}, goal radius {radius:g} m")
     figures.save(figure, out / "robustness.png")
     table = results_table(evaluation["results"])
-    (out / "robustness.md").write_text(f"# Robustness\n\n{table}\n", encoding="utf-8")
+    write_whole(out / "robustness.md", f"# Robustness\n\n{table}\n")
     print(table)
     print(f"wrote robustness.json, robustness.jsonl, robustness.md and robustness.png to {out}")
 

@@ -21,11 +21,12 @@ from typing import Any
 
 import jax
 
+from experiments.common import run
 from experiments.timing import Timing, four_digits
 from sqn_jax.config.presets import PRESETS
 from sqn_jax.env import make_env
 from sqn_jax.maps import load_map
-from sqn_jax.storage.files import write_json
+from sqn_jax.storage.files import probe_file, write_json
 from sqn_jax.training import devices, loop, processes
 from sqn_jax.training.processes import Cluster
 from sqn_jax.training.state import params_shapes
@@ -43,10 +44,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="rounds that are timed")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.repeats < 1:
+        raise ValueError(f"--repeats is {options.repeats}, expected at least 1")
     if options.worker:
         port, count, process, of_each = map(int, options.worker.split(","))
         work(Cluster(f"localhost:{port}", count, process), of_each, options.repeats)
         return
+    if options.out:
+        probe_file(options.out)
     rows = [measured(count, of_each, options.repeats) for count, of_each in LAYOUTS]
     alone, *divided = rows
     for row in divided:
@@ -122,4 +127,4 @@ def work(cluster: Cluster, of_each: int, repeats: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -35,10 +35,17 @@ def earlier_runs(records: Sequence[Path]) -> list[dict[str, Any]]:
 
 def _runs_of(path: Path) -> list[dict[str, Any]]:
     contents = json.loads(path.read_text("utf-8"))
+    try:
+        return _runs_in(contents, path.stem)
+    except (KeyError, TypeError):
+        raise ValueError(f"{path}: no record of runs and no card of a policy") from None
+
+
+def _runs_in(contents: Any, name: str) -> list[dict[str, Any]]:
     if "card" in contents:
         before = contents["card"]
         facts = ("training_episodes", "training_minutes", "device")
-        last = {"run": path.stem, "seeds": 1} | {fact: before[fact] for fact in facts}
+        last = {"run": name, "seeds": 1} | {fact: before[fact] for fact in facts}
         return [*before["went_on_from"], last]
     return [
         {
@@ -87,7 +94,7 @@ def card(
     Of an average nothing is known that is not in `evaluation`, a file of its own.
 
     Raises:
-        ValueError: the run is not finished.
+        ValueError: the run is not finished, or a file is none of an evaluation or of runs.
     """
     if not (run_dir / "summary.json").is_file():
         raise ValueError(f"run folder {run_dir}: not finished, expected a summary.json in it")
@@ -95,7 +102,9 @@ def card(
     rows = RunFolder(run_dir).read_metrics()
     last = next(row for row in rows if row["chunk"] == (checkpoint or rows[-1]["chunk"]))
     file = evaluation or (None if average else run_dir / "evaluation.json")
-    found = json.loads(file.read_text(encoding="utf-8"))["results"] if file else []
+    read = json.loads(file.read_text(encoding="utf-8")) if file else {"results": []}
+    if not isinstance(read, dict) or "results" not in read:
+        raise ValueError(f"{file}: has no results, expected a file of sqn evaluate")
     return {
         "agent": policy.config.algo,
         "method": policy.config.method,
@@ -118,10 +127,17 @@ def card(
                 "success": entry["success"],
                 "time_steps": entry["time_steps"],
             }
-            for entry in found
+            for entry in read["results"]
             if entry["goal_radius"] == policy.config.env.goal_radius
         ],
     }
+
+
+def _share(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"--average: a share of {text}, expected a number") from None
 
 
 def main() -> None:
@@ -141,7 +157,9 @@ def main() -> None:
     single = (options.name, options.checkpoint, options.average, options.evaluation)
     if any(single) and len(options.run_dirs) > 1:
         parser.error("--name, --checkpoint, --average and --evaluation go with a single run")
-    average = (options.average[0], float(options.average[1])) if options.average else None
+    if options.name is not None and Path(options.name).name != options.name:
+        parser.error(f"--name is {options.name}, expected the name of a file without a folder")
+    average = (options.average[0], _share(options.average[1])) if options.average else None
     options.out.mkdir(parents=True, exist_ok=True)
     for run_dir in options.run_dirs:
         policy = load_policy(run_dir, options.checkpoint or "newest")

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from experiments.common import run
 from sqn_jax.agent.trajectory import Trajectory
-from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent
+from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent, group_policies
 from sqn_jax.evaluation.scores import markdown_table
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.evaluation.statistics import seed_interval
@@ -31,7 +31,7 @@ from sqn_jax.policies.interventions import (
 from sqn_jax.policies.pretrained import find_policy
 from sqn_jax.policies.run_policies import Policy, of_seed
 from sqn_jax.runs.evaluate import evaluate_session
-from sqn_jax.storage.files import write_json
+from sqn_jax.storage.files import probe_file, write_json
 
 AS_IT_IS = "as it is"
 NEW_GROUND = 0.1
@@ -218,6 +218,9 @@ def main() -> None:
     for policy in found:
         if policy.config.algo != "sqn":
             raise ValueError(f"policy {policy.name}: is of {policy.config.algo}, expected an sqn")
+    if len(group_policies(found)) > 1:
+        raise ValueError("policies of different settings, expected training seeds of the same")
+    probe_file(options.out)
     settings = Settings(maps=tuple(options.maps), episodes=options.episodes, eval_seeds=1)
     seeds = [
         examine(of_seed(policy, seed), settings)

@@ -26,6 +26,7 @@ from sqn_jax.evaluation.scores import markdown_table, results_table
 from sqn_jax.evaluation.settings import Settings
 from sqn_jax.policies.run_policies import load_policy
 from sqn_jax.runs.evaluate import evaluate_session
+from sqn_jax.storage.files import write_whole
 from sqn_jax.storage.run_folder import RunFolder
 
 
@@ -105,7 +106,7 @@ def main() -> None:
     agents = with_baselines(trained, baselines=True)
     evaluation = evaluate_session(agents, settings, out / "table1.json")
     page = report(evaluation, settings)
-    (out / "table1.md").write_text(page, encoding="utf-8")
+    write_whole(out / "table1.md", page)
     print(page)
     print(f"wrote table1.json, table1.jsonl, table1.md and learning_curves.png to {out}")
 

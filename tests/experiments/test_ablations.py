@@ -23,6 +23,7 @@ from experiments.arm_statistics import (
 )
 from experiments.common import RESULTS
 from experiments.power import paired_differences, power, runs_on_record
+from sqn_jax import config as configs
 from sqn_jax import figures
 from sqn_jax.config import TrainConfig
 
@@ -58,6 +59,11 @@ def test_seeds_of_ones_own_and_side_by_side() -> None:
         planned_runs(arena, ["sqn"], [3], 1, {"seed": 7})
     with pytest.raises(ValueError, match=r"--num-seeds is 2, expected a divisor of the 3 seeds"):
         planned_runs(arena, ["dqn"], num_seeds=2)
+    for name, value in (("algo", "dqn"), ("network.num_skills", 3)):
+        with pytest.raises(ValueError, match=rf"--set {name}: is what arms differ in"):
+            planned_runs(arena, ["sqn"], [3], 1, {name: value})
+    with pytest.raises(ValueError, match=r"--arms sqn sqn: one comes twice"):
+        planned_runs(arena, ["sqn", "sqn"])
 
 
 @pytest.mark.parametrize(
@@ -68,6 +74,8 @@ def test_seeds_of_ones_own_and_side_by_side() -> None:
         (["lerner.discount=0.9"], "lerner.discount: no such setting"),
         (["learner.discount=much"], "learner.discount is 'much', expected a value of type float"),
         (["learner.discount=1.5"], "learner.discount is 1.5, expected"),
+        (["=0.9"], "--set =0.9: expected NAME=VALUE"),
+        (["learner.discount=" + 9_999 * "["], r"learner.discount is '\[\[.*, expected a value of"),
     ],
 )
 def test_settings_that_are_none_are_refused_by_name(texts: list[str], fault: str) -> None:
@@ -95,6 +103,10 @@ def test_no_run_is_begun_that_the_budget_has_no_room_for(
     assert "not trained: equal_seed10, sqn_seed11, r2d2_seed11" in capsys.readouterr().out
     # What lies beyond a run that is left out counts, and with no minutes it alone does.
     (tmp_path / "sqn_seed11_scores.json").touch()
+    with pytest.raises(ValueError, match=r"scores of a run that .*sqn_seed11 does not have"):
+        list(ablations.train_within(runs, ARENAS["smoke"], tmp_path, 0))
+    (tmp_path / "sqn_seed11").mkdir()
+    (tmp_path / "sqn_seed11/summary.json").touch()
     for minutes, expected in ((12, [*done, "sqn_seed11"]), (0, ["sqn_seed11"])):
         results = ablations.train_within(runs, ARENAS["smoke"], tmp_path, minutes)
         assert [result.run.name for result in results] == expected
@@ -259,21 +271,65 @@ def test_runs_on_record_are_taken_from_it(
         (("scores", "sqn"), [], "sqn_seed10 has scores of other maps or tasks"),
         (("settings", "sqn_seed10", "seed"), 7, "sqn_seed10 has other settings than it has"),
         (("settings", "sqn_seed10", "num_robots"), 7, "num_robots is 7, expected one of"),
+        (("settings", "sqn_seed10"), "x", "ablations.json: sqn_seed10: config is 'x'"),
+        (("schema",), 2, "schema is 2, expected 1"),
+        (("scores", "sqn", 0, "spl"), None, "sqn_seed10 has scores that are none"),
+        (("scores", "sqn", 0, "spl"), "0.5", "sqn_seed10 has scores that are none"),
+        (("scores", "sqn", 0, "success"), 7.5, "sqn_seed10 has scores out of range"),
+        (("scores", "sqn", 0, "time_steps"), -1, "sqn_seed10 has scores out of range"),
+        (("curves", "sqn_seed10"), 5, "sqn_seed10 has a curve that is none"),
+        (("curves", "sqn_seed10", 0), {"episodes": "64"}, "sqn_seed10 has a curve that is none"),
+        (("curves", "sqn_seed10", 0), {}, "sqn_seed10 has a curve that is none"),
     ],
 )
 def test_records_of_something_else_are_refused(
-    tmp_path: Path, place: tuple[str, ...], value: Any, fault: str
+    tmp_path: Path, place: tuple[Any, ...], value: Any, fault: str
 ) -> None:
     ablations.write_results("smoke", smoke_results("sqn", {10: 0.6}), tmp_path)
     path = tmp_path / "ablations.json"
     record = json.loads(path.read_text())
-    inner = record
+    inner: Any = record
     for name in place[:-1]:
         inner = inner[name]
     inner[place[-1]] = value
     path.write_text(json.dumps(record))
     with pytest.raises(ValueError, match=fault):
         ablations.earlier_results(path, "smoke", planned_runs(ARENAS["smoke"]))
+
+
+@pytest.mark.parametrize("kept", [None, 5, [], [{"seed": 10}], "half"])
+def test_scores_on_file_that_are_not_whole_are_refused(tmp_path: Path, kept: Any) -> None:
+    (result,) = smoke_results("sqn", {10: 0.6})
+    arena, path = ARENAS["smoke"], tmp_path / "scores.json"
+    settings = dataclasses.asdict(ablations.evaluation_settings(arena))
+    asked = {"run": configs.to_public_dict(result.run.config), **settings}
+    found = {"evaluation": {**asked, "epsilons": arena.epsilons}, "scores": result.scores}
+    path.write_text(json.dumps(found))
+    assert ablations.scores_of(result.run, tmp_path, arena, path) == result.scores
+    found["scores"] = result.scores[:1] if kept == "half" else kept
+    path.write_text(json.dumps(found))
+    with pytest.raises(ValueError, match=r"scores.json has scores (of other|that are none)"):
+        ablations.scores_of(result.run, tmp_path, arena, path)
+
+
+def test_the_page_is_not_written_through_a_link(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("as it was")
+    (tmp_path / "ablations.md").symlink_to(precious)
+    ablations.write_results("smoke", smoke_results("sqn", {10: 0.6}), tmp_path)
+    assert precious.read_text() == "as it was"
+    assert "# Arena smoke" in (tmp_path / "ablations.md").read_text()
+
+
+@pytest.mark.parametrize("minutes", ["nan", "-1"])
+def test_a_budget_is_0_or_more(
+    minutes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = str(tmp_path)
+    monkeypatch.setattr(ablations, "train_within", lambda *arguments: iter(()))
+    monkeypatch.setattr("sys.argv", ["ablations", f"--budget-minutes={minutes}", "--out", out])
+    with pytest.raises(ValueError, match=f"--budget-minutes is {minutes}, expected 0 or more"):
+        ablations.main()
 
 
 def test_the_records_of_the_project_can_be_added_to() -> None:
