@@ -27,7 +27,7 @@ from sqn_jax.config import EnvConfig, NetworkConfig
 from sqn_jax.env import Observation, make_env
 from sqn_jax.env.geometry import beam_angles
 from sqn_jax.evaluation.episodes import episode_keys, run_seeds
-from sqn_jax.evaluation.settings import SPAWN_MODES, task_key
+from sqn_jax.evaluation.settings import SPAWN_MODES, Settings, robot_for, task_key
 from sqn_jax.evaluation.statistics import wilson_interval
 from sqn_jax.policies.greedy import load_policy
 from sqn_jax.storage.files import probe_file, write_json
@@ -98,7 +98,7 @@ def sensor_arrays(sensor: Sensor, env: EnvConfig) -> dict[str, np.ndarray]:
 def measure(name: str, map_name: str, episodes: int, seeds: int) -> list[dict[str, Any]]:
     """Success with each sensor in each kind of tasks."""
     policy = load_policy(name)
-    env = policy.config.env
+    env = robot_for(policy.config.env, Settings(maps=(map_name,)))
     params = [
         {"network": policy.params, "sensor": sensor_arrays(sensor, env)}
         for sensor in SENSORS.values()

@@ -14,7 +14,8 @@ import pytest
 from experiments import common, deployment
 from experiments.deployment import SENSORS, Sensor, SensorNetwork, sensor_arrays
 from sqn_jax.config import EnvConfig
-from sqn_jax.env import Observation
+from sqn_jax.env import EnvParams, Observation
+from sqn_jax.policies.pretrained import find_policy
 
 BEAMS = EnvConfig(num_beams=5, field_of_view_deg=320, max_range=5)  # -160, -80, 0, 80, 160 degrees.
 RANGES = (0.2, 1.0, 0.6, 0.61, 0.9)
@@ -48,6 +49,23 @@ def test_a_sensor_changes_what_it_does_not_see(sensor: Sensor, expected: tuple[f
 
 def test_one_of_the_sensors_is_that_of_the_training() -> None:
     assert seen(SENSORS["as trained"]) == pytest.approx(RANGES)
+
+
+def test_tasks_are_those_of_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In training 0.3 of the tasks of `pretrained:best` have a near goal."""
+    worlds = []
+
+    def kept(keys: Any, params: Any, world: EnvParams, network: Any) -> list[Any]:
+        worlds.append(world)
+        one = np.ones(1)
+        metrics = SimpleNamespace(success=one, time_steps=one, collisions=one)
+        return [SimpleNamespace(metrics=[metrics])]
+
+    monkeypatch.setattr(deployment, "run_seeds", kept)
+    monkeypatch.setattr(deployment, "SENSORS", {"as trained": Sensor()})
+    deployment.measure("pretrained:best", "maze", 1, 1)
+    assert [float(world.near_goal_fraction) for world in worlds] == [0.0, 0.0]
+    assert find_policy("pretrained:best").config.env.near_goal_fraction > 0
 
 
 @pytest.mark.parametrize(
