@@ -84,10 +84,10 @@ def report(arguments: list[str]) -> int:
         seed=options.seed,
         goal_radii=(config.env.goal_radius,),
     )
-    reports.write_report(
+    written = reports.write_report(
         runs, settings, options.out, baselines=not options.no_baselines, epsilon=options.epsilon
     )
-    say(f"wrote {options.out}")
+    say("wrote " + " and ".join(str(path) for path in written))
     return 0
 
 

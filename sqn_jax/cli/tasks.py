@@ -182,12 +182,16 @@ def _check(source: Path, allow_outside: bool) -> int:
     robot = suite.robot_of(EnvConfig())
     load = functools.partial(load_map, robot_radius=robot.robot_radius, allow_outside=allow_outside)
     check_tasks(suite, load, source=named(source))
-    num_maps = len({task.map_file for task in suite.tasks})
-    say(f"{suite.name}: {len(suite.tasks)} tasks on {num_maps} maps, each can be solved")
-    say("robot " + (", ".join(f"{name} {value:g}" for name, value in suite.robot) or "any"))
+    say(f"{suite.name}: {_extent(suite)}, each can be solved")
+    say("robot: " + (", ".join(f"{name} {value:g}" for name, value in suite.robot) or "any"))
     return 0
 
 
 def _report(out: Path, suite: TaskSuite) -> None:
-    num_maps = len({task.map_file for task in suite.tasks})
-    say(f"wrote {out}: {len(suite.tasks)} tasks on {num_maps} maps")
+    say(f"wrote {out}: {_extent(suite)}")
+
+
+def _extent(suite: TaskSuite) -> str:
+    """The numbers of tasks and maps, in words."""
+    counts = {"task": len(suite.tasks), "map": len({task.map_file for task in suite.tasks})}
+    return " on ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())

@@ -83,7 +83,7 @@ def learning_curve(rows: Rows, *, title: str, paper_reward: float | None = None)
     panels = list(figure.subplots(lines, columns, sharex=True).flat)
     # By hand: a layout engine draws every text once more to measure it.
     figure.subplots_adjust(
-        **{"left": 0.065, "right": 0.985, "wspace": 0.16 if columns == 2 else 0.24},
+        **{"left": 0.075, "right": 0.985, "wspace": 0.17 if columns == 2 else 0.26},
         **{"bottom": 0.55 / height, "top": 1 - 1.08 / height, "hspace": 0.3},
     )
     panels[0].set_title("Mean reward per step", fontsize=11)

@@ -93,9 +93,8 @@ def _near_warnings(occupancy_map: OccupancyMap, goal_radius: float) -> tuple[str
         apart = np.linalg.norm(points[i + 1 :] - point, axis=-1)
         for j in np.flatnonzero(apart < goal_radius)[:1]:
             return (
-                f"evaluation points {i} and {i + 1 + j} are {apart[j]:.2f} m apart, less than the "
-                f"goal radius of {goal_radius:g} m: such a task is nearly solved when it "
-                "begins",
+                f"evaluation points {i + 1} and {i + 2 + j} are {apart[j]:.2f} m apart, less than "
+                f"the goal radius of {goal_radius:g} m: such a task is nearly solved at its start",
             )
     return ()
 
@@ -162,11 +161,11 @@ def _pair_lines(
     if len(occupancy_map.evaluation_points) > _SHOWN_POINTS:
         return [f"               (more than {_SHOWN_POINTS}: distances not listed)"]
     points = occupancy_map.to_map_frame(occupancy_map.evaluation_points)
-    lines = [f"  {i}            ({x:.2f}, {y:.2f}) m" for i, (x, y) in enumerate(points)]
+    lines = [f"  {i:<12} ({x:.2f}, {y:.2f}) m" for i, (x, y) in enumerate(points, 1)]
     lines.append("  pair         geodesic  straight  ratio")
     for i, j in combinations(range(len(points)), 2):
         # Two evaluation points in one place have no ratio.
         ratio = f"{geodesic[i, j] / straight[i, j]:5.2f}" if straight[i, j] > 0 else "    -"
-        pair = f"{i} - {j}"
+        pair = f"{i + 1} - {j + 1}"
         lines.append(f"  {pair:12} {geodesic[i, j]:6.2f} m  {straight[i, j]:6.2f} m  {ratio}")
     return lines

@@ -40,7 +40,7 @@ def write_report(
     *,
     baselines: bool = True,
     epsilon: float = 0.0,
-) -> None:
+) -> list[Path]:
     """Evaluate runs with a progress bar and write a page about them, and one to play on.
 
     Args:
@@ -49,6 +49,9 @@ def write_report(
         out: the HTML file; an existing one is replaced, as is `path_beside` it.
         baselines: whether to evaluate the oracle and the wall follower too.
         epsilon: probability of a random action of the policies in each step; 0 is greedy.
+
+    Returns:
+        The files that were written: without the second where no policy can be played.
 
     Raises:
         ValueError: a map is unusable for a robot, two runs have the same name, or the file
@@ -62,6 +65,7 @@ def write_report(
     except ValueError as error:
         say(f"{play_file} is left out: {error}")
         html.write_page(out, to_html(content, pictures, no_play=str(error)))
-        return
+        return [out]
     html.write_page(play_file, playable.html)
     html.write_page(out, to_html(content, pictures, playable.links))
+    return [out, play_file]

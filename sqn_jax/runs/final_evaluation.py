@@ -170,7 +170,8 @@ def conclude(
         say(
             f"{'learning curve:':19} mean reward {np.mean(curve['mean_reward']):.2f} at its end"
             + ("" if paper is None else f" (the paper's {config.algo.upper()}: {paper:.2f})")
-            + f"; {curve['points']} evaluations, {_duration(curve['seconds'])} in all"
+            + f"; {curve['points']} evaluation{'s' * (curve['points'] != 1)}, "
+            + f"{_duration(curve['seconds'])} in all"
         )
     if has_figures:
         say(f"figures in {folder.figures}")

@@ -166,7 +166,7 @@ def test_the_report_names_what_a_person_asks_for() -> None:
     assert "components     2" in report
     assert "grey looks odd" in report
     # From (0.5, 2.5) to (2.0, 0.55) the way is straight: hypot(1.5, 1.95) = 2.46 m.
-    line = next(line for line in report.splitlines() if line.startswith("  0 - 1"))
+    line = next(line for line in report.splitlines() if line.startswith("  1 - 2"))
     assert float(line.split()[3]) == pytest.approx(2.46, rel=0.02)
     assert float(line.split()[5]) == pytest.approx(2.46, abs=0.005)
     assert "max_steps is" not in report
@@ -178,7 +178,7 @@ def test_evaluation_points_within_the_goal_radius_of_each_other_are_warned_of(
     x: float, is_warned: bool
 ) -> None:
     report = describe(room_map(evaluation_points=np.array([[2.0, 2.5], [1.0, 1.0], [x, 1.0]])), 0.1)
-    apart = f"evaluation points 1 and 2 are {x - 1:.2f} m apart, less than the goal radius of 0.3 m"
+    apart = f"evaluation points 2 and 3 are {x - 1:.2f} m apart, less than the goal radius of 0.3 m"
     assert (apart in report) == is_warned
     assert "nan" not in report
 
