@@ -72,7 +72,7 @@ class Agent(Protocol):
 
 
 def require_robot(agent: Agent, robot: EnvConfig) -> None:
-    """Refuse a robot that an agent cannot drive, before anything is run.
+    """Refuse a robot that an agent cannot control, before anything is run.
 
     Args:
         agent: a trained policy or a baseline.

@@ -86,7 +86,7 @@ def evaluate_suite_session(
         The contents of the evaluation file, and the records of the episodes.
 
     Raises:
-        ValueError: an agent cannot drive the suite's robot, a map is unusable, a task cannot be
+        ValueError: an agent cannot control the suite's robot, a map is unusable, a task cannot be
             solved, or the episodes do not fit into memory; nothing has been run.
     """
     episodes = num_suite_episodes(agents, suite, settings)
@@ -106,7 +106,7 @@ def suite_maps(
     """What makes the maps of a suite, by the radius of a robot, m; its tasks are checked.
 
     Raises:
-        ValueError: an agent cannot drive the suite's robot, a map is unusable, or a task cannot be
+        ValueError: an agent cannot control the suite's robot, a map is unusable, or a task cannot be
             solved.
     """
     for agent in agents:

@@ -408,7 +408,7 @@ def test_a_chunk_is_made_while_the_one_before_is_used() -> None:
     assert list(ahead) == [2, 3]
 
 
-def test_a_robot_that_an_agent_cannot_drive_is_refused_before_anything_is_run() -> None:
+def test_a_robot_that_an_agent_cannot_control_is_refused_before_anything_is_run() -> None:
     """Its network takes 71 beams; both baselines have to move."""
     config = TrainConfig(network=NETWORK)
     network = make_network("sqn", NETWORK, NUM_ACTIONS)
