@@ -106,8 +106,8 @@ def suite_maps(
     """What makes the maps of a suite, by the radius of a robot, m; its tasks are checked.
 
     Raises:
-        ValueError: an agent cannot control the suite's robot, a map is unusable, or a task cannot be
-            solved.
+        ValueError: an agent cannot control the suite's robot, a map is unusable, or a task cannot
+            be solved.
     """
     for agent in agents:
         require_robot(agent, robot_for(agent.env_config, suite))
