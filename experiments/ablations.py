@@ -34,7 +34,6 @@ from experiments.arm_statistics import (
 from experiments.common import run, train_unless_done
 from sqn_jax import config as configs
 from sqn_jax import figures
-from sqn_jax.config import TrainConfig
 from sqn_jax.evaluation.agents import EpisodeBatch, TrainedAgent, with_epsilons
 from sqn_jax.evaluation.settings import Settings, Tasks
 from sqn_jax.outside.reading import read_json
@@ -90,7 +89,7 @@ def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict
             raise ValueError(
                 f"{path}: of another run or evaluation, expected --out to name a folder"
             )
-        return whole_scores(found.get("scores"), trained.config, arena, f"{path}")
+        return whole_scores(found.get("scores"), trained, arena, str(path))
     rows: dict[tuple[Any, ...], dict[str, list[float]]] = {}
 
     def keep(batch: EpisodeBatch) -> None:
@@ -114,15 +113,14 @@ def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict
     return scores
 
 
-def whole_scores(rows: Any, config: TrainConfig, arena: Arena, source: str) -> list[dict[str, Any]]:
+def whole_scores(rows: Any, trained: Run, arena: Arena, source: str) -> list[dict[str, Any]]:
     """Rows read from a file, once they are what an evaluation of a run writes.
 
     Raises:
         ValueError: one line that begins with the source: a row is missing, comes twice or is of
             something else, or a number is none or out of its range.
     """
-    seeds = range(config.seed, config.seed + config.num_seeds)
-    asked = itertools.product(seeds, arena.maps, TASKS, arena.epsilons)
+    asked = itertools.product(trained.seeds, arena.maps, TASKS, arena.epsilons)
     try:
         found = [(row["seed"], row["map"], row["tasks"], row["epsilon"]) for row in rows]
         is_asked = sorted(found) == sorted(asked)
@@ -130,7 +128,7 @@ def whole_scores(rows: Any, config: TrainConfig, arena: Arena, source: str) -> l
             0 <= row["spl"] <= 1 and 0 <= row["success"] <= 1 and row["time_steps"] >= 0
             for row in rows
         )
-    except (AttributeError, KeyError, TypeError):
+    except (KeyError, TypeError):
         raise ValueError(f"{source} has scores that are none, expected those of a run") from None
     if not is_asked:
         raise ValueError(f"{source} has scores of other maps or tasks")
@@ -183,13 +181,12 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
     results = {}
     for each in planned:
         source = f"{path}: {each.name}"
-        seeds = range(each.config.seed, each.config.seed + each.config.num_seeds)
         try:
             settings = record["settings"].get(each.name)
             if settings is None:
                 continue
             config = configs.from_dict(settings)
-            rows = [row for row in record["scores"][each.arm] if row["seed"] in seeds]
+            rows = [row for row in record["scores"][each.arm] if row["seed"] in each.seeds]
             curve = record.get("curves", {}).get(each.name, [])
         except (AttributeError, KeyError, TypeError):
             raise ValueError(f"{path}: not a whole ablations.json") from None
@@ -197,7 +194,7 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
             raise ValueError(f"{source}: {error}") from None
         if config != each.config:
             raise ValueError(f"{source} has other settings than it has here")
-        scores = whole_scores(rows, each.config, ARENAS[name], source)
+        scores = whole_scores(rows, each, ARENAS[name], source)
         results[each.name] = Result(each, scores, whole_curve(curve, source))
     return results
 

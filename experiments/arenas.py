@@ -109,6 +109,11 @@ class Run:
     def name(self) -> str:
         return run_name(self.arm, self.config)
 
+    @property
+    def seeds(self) -> range:
+        """Its training seeds."""
+        return range(self.config.seed, self.config.seed + self.config.num_seeds)
+
 
 def with_settings(config: TrainConfig, changes: Mapping[str, Any]) -> TrainConfig:
     """Settings with some changed, by their dotted names.
