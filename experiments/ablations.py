@@ -1,6 +1,6 @@
 """Does the skill ensemble help? Arms trained alike, compared by their training seeds.
 
-    python -m experiments.ablations --arena quick|caves|paper|smoke [--arms A ...] [--seeds S ...]
+    python -m experiments.ablations --arena quick|wide|caves|paper|smoke [--arms A ...]
 
 Trains what is missing of an arena of docs/ENSEMBLE.md, the first seeds of all arms first, evaluates
 every run once, and writes ablations.json, ablations.md, learning_curves.png and differences.png.
@@ -20,14 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.arenas import ARENAS, ARMS, DECIDED, Arena, Run, parse_changes, planned_runs
+from experiments.arenas import ARENAS, ARMS, REFERENCE, Arena, Run, parse_changes, planned_runs
 from experiments.arm_statistics import (
     PRIMARY,
     Scores,
     arm_results,
     arms_table,
     by_seed,
-    decision_line,
+    comparison_line,
     paired_by_seed,
     verdict,
 )
@@ -74,6 +74,11 @@ def evaluation_settings(arena: Arena) -> Settings:
     )
 
 
+def evaluation_of(arena: Arena) -> dict[str, Any]:
+    """The evaluation of an arena; the scores of arenas that share it can be compared."""
+    return dataclasses.asdict(evaluation_settings(arena)) | {"epsilons": arena.epsilons}
+
+
 def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict[str, Any]]:
     """The scores of a run by training seed, map, tasks and epsilon; evaluated unless on file.
 
@@ -81,8 +86,8 @@ def scores_of(trained: Run, folder: Path, arena: Arena, path: Path) -> list[dict
         ValueError: the file is of another evaluation.
     """
     settings = evaluation_settings(arena)
-    asked = {**dataclasses.asdict(settings), "epsilons": arena.epsilons}
-    asked = json.loads(json.dumps({"run": configs.to_public_dict(trained.config), **asked}))
+    run_settings = configs.to_public_dict(trained.config)
+    asked = json.loads(json.dumps({"run": run_settings, **evaluation_of(arena)}))
     if path.is_file():
         found = read_json(path, MAX_SCORES_BYTES, "scores")
         if not isinstance(found, dict) or found.get("evaluation") != asked:
@@ -167,15 +172,16 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
 
     Args:
         path: an ablations.json.
-        name: of the arena.
+        name: of the arena; a record of another that is judged alike will do.
         planned: the runs that are looked for.
 
     Raises:
         ValueError: the file is no record of this arena, or a run has other settings or scores.
     """
-    record = read_json(path, MAX_SCORES_BYTES, "ablations.json")
-    if not isinstance(record, dict) or record.get("arena") != name:
-        raise ValueError(f"{path}: expected an ablations.json of the arena {name}")
+    arena, record = ARENAS[name], read_json(path, MAX_SCORES_BYTES, "ablations.json")
+    alike = [other for other, each in ARENAS.items() if evaluation_of(each) == evaluation_of(arena)]
+    if not isinstance(record, dict) or record.get("arena") not in alike:
+        raise ValueError(f"{path}: expected an ablations.json of the arena {' or '.join(alike)}")
     if record.get("schema") != SCHEMA:
         raise ValueError(f"{path}: schema is {record.get('schema')!r}, expected {SCHEMA}")
     results = {}
@@ -194,7 +200,7 @@ def earlier_results(path: Path, name: str, planned: Sequence[Run]) -> dict[str, 
             raise ValueError(f"{source}: {error}") from None
         if config != each.config:
             raise ValueError(f"{source} has other settings than it has here")
-        scores = whole_scores(rows, each, ARENAS[name], source)
+        scores = whole_scores(rows, each, arena, source)
         results[each.name] = Result(each, scores, whole_curve(curve, source))
     return results
 
@@ -226,13 +232,21 @@ def train_within(
         print(f"--budget-minutes {minutes:g} are used up; not trained: {', '.join(left_out)}")
 
 
-def decision(scores: Scores, arena: Arena) -> dict[str, Any] | None:
-    """The comparison by which an arena is decided, greedy; None unless both arms are there."""
-    if not all(arm in scores for arm in DECIDED):
+def comparison(scores: Scores, arena: Arena, arms: tuple[str, str]) -> dict[str, Any] | None:
+    """Two arms on the maps that decide, greedy; None unless both are there."""
+    if not all(arm in scores for arm in arms):
         return None
     selected = {"map": arena.primary, "tasks": PRIMARY_TASKS, "epsilon": 0.0}
-    compared = paired_by_seed(*(by_seed(scores[arm], PRIMARY, **selected) for arm in DECIDED))
-    return {"arms": DECIDED, "maps": arena.primary, **compared, "verdict": verdict(compared)}
+    compared = paired_by_seed(*(by_seed(scores[arm], PRIMARY, **selected) for arm in arms))
+    return {"arms": arms, "maps": arena.primary, **compared}
+
+
+def decision(scores: Scores, arena: Arena) -> dict[str, Any] | None:
+    """The comparison by which an arena is decided, with its verdict; None unless it can be made."""
+    compared = comparison(scores, arena, arena.decided)
+    if compared is None:
+        return None
+    return compared | {"verdict": verdict(compared, arena.least_difference)}
 
 
 def write_results(name: str, results: Sequence[Result], out: Path) -> str:
@@ -240,16 +254,18 @@ def write_results(name: str, results: Sequence[Result], out: Path) -> str:
     arena, scores = ARENAS[name], Scores()
     for result in results:
         scores.setdefault(result.run.arm, []).extend(result.scores)
-    compared = arm_results(scores, reference=DECIDED[0], primary=arena.primary)
+    compared = arm_results(scores, reference=REFERENCE, primary=arena.primary)
     decided = decision(scores, arena)
+    tried = [comparison(scores, arena, arms) for arms in arena.described]
+    described = [found for found in tried if found is not None]
     settings = {each.run.name: configs.to_public_dict(each.run.config) for each in results}
     curves = {each.run.name: each.curve for each in results if each.curve}
-    record = {"schema": SCHEMA, "arena": name, "decision": decided, "results": compared}
-    record |= {"scores": scores, "settings": settings, "curves": curves}
+    record = {"schema": SCHEMA, "arena": name, "decision": decided, "described": described}
+    record |= {"results": compared, "scores": scores, "settings": settings, "curves": curves}
     write_json(out / "ablations.json", record)
     page = f"# Arena {name}\n\n{arms_table(compared)}\n"
-    if decided is not None:
-        page += f"\n{decision_line(decided)}\n"
+    for found in described if decided is None else (decided, *described):
+        page += f"\n{comparison_line(found)}\n"
     write_whole(out / "ablations.md", page)
     draw_curves(name, results, out / "learning_curves.png")
     others = [entry for entry in compared if entry["difference"] is not None]

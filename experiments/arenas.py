@@ -31,14 +31,11 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 """What each arm changes, by the dotted names of the settings."""
 
-DECIDED = ("sqn", "r2d2")
-"""The arms whose difference is the answer."""
+REFERENCE = "sqn"
+"""The arm beside which all others are shown."""
 
 UNSEEN = ("maze:100", "maze:101", "maze:102")
 """Mazes that no run is trained on."""
-
-FIRST_SEED = 10
-"""Seeds below have been used to choose settings."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +44,18 @@ class Arena:
 
     preset: str
     seeds: Mapping[str, int]
-    """How many seeds each arm has, from `FIRST_SEED` on."""
+    """How many seeds each arm has, from `first_seed` on."""
     maps: tuple[str, ...]
     primary: tuple[str, ...]
     """The maps among them by which the arena is decided."""
+    decided: tuple[str, str] = ("sqn", "r2d2")
+    """The arms whose difference, first minus second, is the answer."""
+    described: tuple[tuple[str, str], ...] = ()
+    """Arms that are compared likewise, and decide nothing."""
+    least_difference: float = 0.0
+    """The mean difference in SPL that a yes takes."""
+    first_seed: int = 10
+    """Seeds below 10 have been used to choose settings."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     epsilons: tuple[float, ...] = (0.0,)
     episodes: int = 100
@@ -66,6 +71,16 @@ ARENAS = {
         },
         ("maze", *UNSEEN),
         primary=("maze",),
+    ),
+    "wide": Arena(
+        "quick",
+        {"r2d2_wide": 6, "sqn": 6, "r2d2": 6},
+        ("maze", *UNSEEN),
+        primary=UNSEEN,
+        decided=("r2d2_wide", "sqn"),
+        described=(("r2d2_wide", "r2d2"),),
+        least_difference=0.02,
+        first_seed=13,
     ),
     "caves": Arena(
         "best",
@@ -193,7 +208,7 @@ def planned_runs(
             raise ValueError(
                 f"--num-seeds is {num_seeds}, expected a divisor of the {count} seeds of {arm}"
             )
-        return range(FIRST_SEED, FIRST_SEED + count, num_seeds)
+        return range(arena.first_seed, arena.first_seed + count, num_seeds)
 
     longest = max(len(seeds_of(arm)) for arm in chosen)
     return [

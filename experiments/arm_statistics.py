@@ -46,31 +46,32 @@ def paired_by_seed(first: Mapping[int, float], second: Mapping[int, float]) -> d
     }
 
 
-def verdict(comparison: Mapping[str, Any]) -> str:
+def verdict(comparison: Mapping[str, Any], least_difference: float = 0.0) -> str:
     """What a comparison says, by the rule that was stated beforehand: yes, no or undecided.
 
-    "yes": significantly more, and maybe by `RELEVANT` or more. "no": the interval leaves no room
-    for `RELEVANT`. Else undecided, as it is with fewer than `FEWEST_SEEDS`.
+    "yes": significantly more, maybe by `RELEVANT` or more, and by `least_difference` or more on
+    average. "no": the interval leaves no room for `RELEVANT`. Else undecided, as it is with fewer
+    than `FEWEST_SEEDS`.
     """
     if len(comparison["seeds"]) < FEWEST_SEEDS:
         return "undecided"
     if comparison["ci95"][1] < RELEVANT:
         return "no"
-    is_more = comparison["difference"] > 0 and comparison["p_value"] < LEVEL
-    return "yes" if is_more else "undecided"
+    difference = comparison["difference"]
+    is_more = difference > 0 and comparison["p_value"] < LEVEL
+    return "yes" if is_more and difference >= least_difference else "undecided"
 
 
-def decision_line(decided: Mapping[str, Any]) -> str:
-    """A decision in a line: arms, difference, interval, p-value and verdict."""
-    first, second = decided["arms"]
-    line = f"{first} minus {second}, {len(decided['seeds'])} seeds of both: "
-    if decided["difference"] is None:
-        return line + decided["verdict"]
-    described = {"mean": decided["difference"], "ci95": decided["ci95"]}
-    line += f"SPL {_cell(described, sign='+')}"
-    if decided["p_value"] is not None:
-        line += f", p {_p(decided['p_value'])}"
-    return f"{line}: {decided['verdict']}"
+def comparison_line(compared: Mapping[str, Any]) -> str:
+    """A comparison in a line: arms, difference, interval, p-value, and its verdict, if any."""
+    first, second = compared["arms"]
+    line = f"{first} minus {second}, {len(compared['seeds'])} seeds of both"
+    if compared["difference"] is not None:
+        described = {"mean": compared["difference"], "ci95": compared["ci95"]}
+        line += f": SPL {_cell(described, sign='+')}"
+    if compared["p_value"] is not None:
+        line += f", p {_p(compared['p_value'])}"
+    return f"{line}: {compared['verdict']}" if "verdict" in compared else line
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -106,11 +107,13 @@ def _groups(
     rows: Sequence[Mapping[str, Any]], primary: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
     """Maps that are judged together: the primary ones, procedural ones of a kind, others alone."""
-    groups = {"maps that decide": tuple(primary)} if len(primary) > 1 else {}
+    groups: dict[str, tuple[str, ...]] = {}
     for name in dict.fromkeys(row["map"] for row in rows):
         kind, _, number = name.partition(":")
         group = f"{kind}s unseen" if number else name
         groups[group] = (*groups.get(group, ()), name)
+    if len(primary) > 1 and tuple(primary) not in groups.values():
+        groups = {"maps that decide": tuple(primary)} | groups
     return groups
 
 

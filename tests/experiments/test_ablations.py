@@ -36,13 +36,16 @@ def test_the_runs_of_an_arena_differ_in_what_their_arms_say_and_in_their_seeds(n
     plain = {run.config.seed: run.config for run in runs if run.arm == "sqn"}
     for run in runs:
         assert run.arm == "sqn" or run.config != plain[run.config.seed]
-        if run.config.seed == 10:  # To change settings takes its time.
-            assert run.config == with_settings(plain[10], ARMS[run.arm])
+        if run.config.seed == arena.first_seed:  # To change settings takes its time.
+            assert run.config == with_settings(plain[arena.first_seed], ARMS[run.arm])
     # Whatever the budget leaves, the arms that decide have the same seeds, or one more.
     for count in range(1, len(runs) + 1):
         begun = [run.arm for run in runs[:count]]
-        assert abs(begun.count("sqn") - begun.count("r2d2")) <= 1
+        first, second = (begun.count(arm) for arm in arena.decided)
+        assert abs(first - second) <= 1
     assert set(arena.primary) <= set(arena.maps)
+    assert {arm for arms in (arena.decided, *arena.described) for arm in arms} <= set(arena.seeds)
+    assert arena.first_seed >= 10
 
 
 def test_seeds_of_ones_own_and_side_by_side() -> None:
@@ -146,6 +149,9 @@ def test_the_verdict_is_that_of_the_protocol(
     found = {"difference": mean, "ci95": interval, "p_value": p_value}
     assert verdict({**found, "seeds": [1] if interval is None else range(6)}) == expected
     assert verdict({**found, "seeds": range(5)}) == "undecided"
+    if expected == "yes":  # By 0.03.
+        assert verdict({**found, "seeds": range(6)}, 0.03) == "yes"
+        assert verdict({**found, "seeds": range(6)}, 0.031) == "undecided"
 
 
 def test_p_values_are_adjusted_as_holm_says() -> None:
@@ -221,6 +227,9 @@ def test_maps_that_decide_are_also_judged_together() -> None:
     assert [entry["maps"] for entry in others] == ["mazes unseen"] * 2 + ["caves unseen"] * 2
     alone = arm_results(scores, reference="sqn", primary=("maze:100",))
     assert "maps that decide" not in {entry["maps"] for entry in alone}
+    mazes = {"sqn": rows({10: 0.7}, "maze:100") + rows({10: 0.1}, "maze:101")}
+    (entry,) = arm_results(mazes, reference="sqn", primary=("maze:100", "maze:101"))
+    assert (entry["maps"], entry["spl"]["mean"]) == ("mazes unseen", pytest.approx(0.4))
 
 
 def smoke_results(arm: str, spl: dict[int, float]) -> list[ablations.Result]:
@@ -266,7 +275,7 @@ def test_runs_on_record_are_taken_from_it(
 @pytest.mark.parametrize(
     ("place", "value", "fault"),
     [
-        (("arena",), "quick", "expected an ablations.json of the arena smoke"),
+        (("arena",), "quick", "expected an ablations.json of the arena smoke$"),
         (("scores",), None, "not a whole ablations.json"),
         (("scores", "sqn"), [], "sqn_seed10 has scores of other maps or tasks"),
         (("settings", "sqn_seed10", "seed"), 7, "sqn_seed10 has other settings than it has"),
@@ -333,10 +342,38 @@ def test_a_budget_is_0_or_more(
 
 
 def test_the_records_of_the_project_can_be_added_to() -> None:
-    for name in ("quick", "caves"):
+    for name, of in (("quick", "quick"), ("caves", "caves"), ("wide", "quick")):
         planned = planned_runs(ARENAS[name], ["sqn", "r2d2"])
-        found = ablations.earlier_results(RESULTS / f"ensemble_{name}.json", name, planned)
+        found = ablations.earlier_results(RESULTS / f"ensemble_{of}.json", name, planned)
         assert list(found) == [run.name for run in planned]
+    with pytest.raises(ValueError, match=r"expected an ablations.json of the arena quick or wide$"):
+        ablations.earlier_results(RESULTS / "ensemble_caves.json", "wide", planned)
+
+
+def test_a_follow_up_says_what_it_decides_and_what_it_describes(tmp_path: Path) -> None:
+    spl = {"sqn": 0.50, "r2d2_wide": 0.55, "r2d2": 0.535}
+    results = []
+    for run in planned_runs(ARENAS["wide"]):
+        seed, scores = run.config.seed, []
+        for name in ("maze", "maze:100", "maze:101", "maze:102"):
+            for tasks in ("random pairs", "evaluation points"):
+                # Everywhere else SQN is ahead, which decides nothing.
+                is_decisive = tasks == "random pairs" and name != "maze"
+                value = spl[run.arm] if is_decisive else 0.9 * (run.arm == "sqn")
+                scores += rows({seed: value + 0.001 * seed}, name, tasks)
+        results.append(ablations.Result(run, scores, []))
+    *_, decided, _, described = ablations.write_results("wide", results, tmp_path).splitlines()
+    # All six differences are alike: of 64 ways of exchanging two have as large a sum.
+    assert decided == (
+        "r2d2_wide minus sqn, 6 seeds of both: SPL +0.050 [+0.050, +0.050], p 0.031: yes"
+    )
+    assert described == (
+        "r2d2_wide minus r2d2, 6 seeds of both: SPL +0.015 [+0.015, +0.015], p 0.031"
+    )
+    record = json.loads((tmp_path / "ablations.json").read_text())
+    assert (record["decision"]["verdict"], record["decision"]["seeds"][0]) == ("yes", 13)
+    assert [found["arms"] for found in record["described"]] == [["r2d2_wide", "r2d2"]]
+    assert "verdict" not in record["described"][0]
 
 
 def test_the_power_is_that_of_tables_and_of_simulated_seeds() -> None:
