@@ -219,12 +219,19 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
 
 
 def table_note(results: Sequence[dict[str, Any]]) -> str:
-    """What the ± of `results_table` and the intervals of the file are over."""
-    note = "±: over the means of the evaluation seeds"
-    if any(len(entry["training_seeds"]) > 1 for entry in results):
-        note += " of each training seed; 95 % intervals (file): over training seeds and tasks"
-        return f"{note}, of an agent with one training seed over tasks only"
-    return f"{note}; 95 % intervals (file): over tasks only, one training seed"
+    """What the ± of `results_table`, if there is one, and the intervals of the file are over."""
+    several = any(len(entry["training_seeds"]) > 1 for entry in results)
+    parts = []
+    if any(entry["success"]["std_of_means"] is not None for entry in results):
+        parts.append("±: over the means of the evaluation seeds")
+        parts[0] += " of each training seed" if several else ""
+    parts.append(
+        "95 % intervals (file): over training seeds and tasks, of an agent with one training "
+        "seed over tasks only"
+        if several
+        else "95 % intervals (file): over tasks only, one training seed"
+    )
+    return "; ".join(parts)
 
 
 def _row_of(entry: dict[str, Any]) -> tuple[Any, ...]:

@@ -146,9 +146,17 @@ def test_episodes_between_the_same_points_are_no_independent_evidence() -> None:
 
 
 def test_the_note_of_the_table_says_what_intervals_are_over() -> None:
-    one, two = {"training_seeds": [0]}, {"training_seeds": [0, 1]}
-    assert "over tasks only, one training seed" in table_note([one, one])
+    one, two = (
+        {"training_seeds": seeds, "success": {"std_of_means": 0.1}} for seeds in ([0], [0, 1])
+    )
+    assert table_note([one, one]) == (
+        "±: over the means of the evaluation seeds; "
+        "95 % intervals (file): over tasks only, one training seed"
+    )
+    assert "evaluation seeds of each training seed; 95" in table_note([one, two])
     assert "over training seeds and tasks" in table_note([one, two])
+    without = {"training_seeds": [0], "success": {"std_of_means": None}}
+    assert "±" not in table_note([without])
 
 
 def test_no_success_and_no_shortest_way_are_said_and_not_made_up() -> None:
