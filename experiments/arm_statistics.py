@@ -106,15 +106,17 @@ def _is_one_of(value: Any, wanted: Any) -> bool:
 def _groups(
     rows: Sequence[Mapping[str, Any]], primary: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Maps that are judged together: the primary ones, procedural ones of a kind, others alone."""
+    """Maps that are judged together: first the primary ones, procedural ones of a kind, others."""
     groups: dict[str, tuple[str, ...]] = {}
     for name in dict.fromkeys(row["map"] for row in rows):
         kind, _, number = name.partition(":")
         group = f"{kind}s unseen" if number else name
         groups[group] = (*groups.get(group, ()), name)
-    if len(primary) > 1 and tuple(primary) not in groups.values():
-        groups = {"maps that decide": tuple(primary)} | groups
-    return groups
+    if not primary:
+        return groups
+    deciding = [group for group, maps in groups.items() if maps == tuple(primary)]
+    # The first key stays first.
+    return {(*deciding, "maps that decide")[0]: tuple(primary)} | groups
 
 
 def arm_results(

@@ -227,9 +227,11 @@ def test_maps_that_decide_are_also_judged_together() -> None:
     assert [entry["maps"] for entry in others] == ["mazes unseen"] * 2 + ["caves unseen"] * 2
     alone = arm_results(scores, reference="sqn", primary=("maze:100",))
     assert "maps that decide" not in {entry["maps"] for entry in alone}
-    mazes = {"sqn": rows({10: 0.7}, "maze:100") + rows({10: 0.1}, "maze:101")}
-    (entry,) = arm_results(mazes, reference="sqn", primary=("maze:100", "maze:101"))
+    maps = {"maze": 0.9, "maze:100": 0.7, "maze:101": 0.1}
+    mazes = {"sqn": [row for name, spl in maps.items() for row in rows({10: spl}, name)]}
+    entry, last = arm_results(mazes, reference="sqn", primary=("maze:100", "maze:101"))
     assert (entry["maps"], entry["spl"]["mean"]) == ("mazes unseen", pytest.approx(0.4))
+    assert last["maps"] == "maze"
 
 
 def smoke_results(arm: str, spl: dict[int, float]) -> list[ablations.Result]:
