@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from experiments.arm_statistics import RELEVANT
 from experiments.common import run_name
 from sqn_jax import config as configs
 from sqn_jax.config import TrainConfig
@@ -79,7 +80,7 @@ ARENAS = {
         primary=UNSEEN,
         decided=("r2d2_wide", "sqn"),
         described=(("r2d2_wide", "r2d2"),),
-        least_difference=0.02,
+        least_difference=RELEVANT,
         first_seed=13,
     ),
     "caves": Arena(

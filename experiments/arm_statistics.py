@@ -114,9 +114,9 @@ def _groups(
         groups[group] = (*groups.get(group, ()), name)
     if not primary:
         return groups
-    deciding = [group for group, maps in groups.items() if maps == tuple(primary)]
-    # The first key stays first.
-    return {(*deciding, "maps that decide")[0]: tuple(primary)} | groups
+    alike = [group for group, maps in groups.items() if set(maps) == set(primary)]
+    deciding = alike[0] if alike else "maps that decide"
+    return {deciding: tuple(primary), **groups}
 
 
 def arm_results(

@@ -221,17 +221,16 @@ def results_table(results: Sequence[dict[str, Any]]) -> str:
 def table_note(results: Sequence[dict[str, Any]]) -> str:
     """What the ± of `results_table`, if there is one, and the intervals of the file are over."""
     several = any(len(entry["training_seeds"]) > 1 for entry in results)
-    parts = []
-    if any(entry["success"]["std_of_means"] is not None for entry in results):
-        parts.append("±: over the means of the evaluation seeds")
-        parts[0] += " of each training seed" if several else ""
-    parts.append(
-        "95 % intervals (file): over training seeds and tasks, of an agent with one training "
-        "seed over tasks only"
-        if several
-        else "95 % intervals (file): over tasks only, one training seed"
-    )
-    return "; ".join(parts)
+    spread = "±: over the means of the evaluation seeds"
+    intervals = "95 % intervals (file): over tasks only, one training seed"
+    if several:
+        spread += " of each training seed"
+        intervals = (
+            "95 % intervals (file): over training seeds and tasks, of an agent with one training "
+            "seed over tasks only"
+        )
+    has_spread = any(entry["success"]["std_of_means"] is not None for entry in results)
+    return f"{spread}; {intervals}" if has_spread else intervals
 
 
 def _row_of(entry: dict[str, Any]) -> tuple[Any, ...]:
