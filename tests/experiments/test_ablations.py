@@ -232,6 +232,8 @@ def test_maps_that_decide_are_also_judged_together() -> None:
     entry, last = arm_results(mazes, reference="sqn", primary=("maze:100", "maze:101"))
     assert (entry["maps"], entry["spl"]["mean"]) == ("mazes unseen", pytest.approx(0.4))
     assert last["maps"] == "maze"
+    turned = arm_results(mazes, reference="sqn", primary=("maze:101", "maze:100"))
+    assert turned == [entry, last]
 
 
 def smoke_results(arm: str, spl: dict[int, float]) -> list[ablations.Result]:
